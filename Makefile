@@ -1,0 +1,60 @@
+# Needs Linux, make and Python 3.11 (or 3.12) with venv and pip; everything else goes into .venv.
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-slow check format bench wheel clean
+
+SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
+PYTHON ?= $(firstword $(foreach p,python3.11 python3 python3.12,$(shell $(p) -c "$(SUITABLE)" 2>/dev/null && echo $(p))))
+BIN := .venv/bin
+STAMP := .venv/.installed
+RUN := $(BIN)/marl-handover
+WORKERS ?= 2
+# Two workers on two cores: let no numerical library start threads of its own in each.
+ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
+
+help:
+	@echo "make demo       install, train a supervisor, evaluate it against the exact planner, leave pictures in runs/"
+	@echo "make test       install and run the tests; make test-slow runs the slow ones too"
+	@echo "make check      style, types and import layers; make format repairs the style"
+	@echo "make bench      measure speed"
+	@echo "make wheel      build a wheel into dist/"
+
+$(STAMP): pyproject.toml constraints.txt
+	@if [ -z "$(PYTHON)" ]; then echo "make: Python 3.11 or 3.12 with venv and pip is needed; install it (apt install python3.11-venv) or name it: make PYTHON=/path/to/python3.11" >&2; exit 2; fi
+	@$(PYTHON) -c "$(SUITABLE)" 2>/dev/null || { echo "make: $(PYTHON) is not Python 3.11 or 3.12 with venv and pip; name another: make PYTHON=/path/to/python3.11" >&2; exit 2; }
+	@test -x $(BIN)/python && $(BIN)/python -c "$(SUITABLE)" 2>/dev/null || $(PYTHON) -m venv --clear .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	@touch $@
+
+demo: $(STAMP)
+	$(RUN) train out=runs/demo
+	$(RUN) evaluate policy=runs/demo episodes=10000 json=runs/demo/evaluation.json
+	$(RUN) evaluate policy=exact episodes=10000 json=runs/demo/exact.json
+	$(RUN) workspace out=runs/demo
+	$(RUN) plot kind=run run=runs/demo
+	@echo "The run, its evaluation and the pictures are in runs/demo"
+
+test: $(STAMP)
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS)
+
+test-slow: $(STAMP)
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) -m "not gpu and not hardware"
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(STAMP)
+	$(BIN)/python bench/run.py
+
+wheel: $(STAMP)
+	$(BIN)/python -m build --wheel --outdir dist .
+
+clean:
+	rm -rf .venv build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache

@@ -1,0 +1,43 @@
+"""One code path for numpy arrays and torch tensors.
+
+The rule book is written once against the functions that numpy 2 and torch spell alike (``sin``, ``atan2``, ``where``, ``stack``, ``concat`` ...).
+Importing this module does not import torch, so an exported policy runs without it.
+"""
+
+from __future__ import annotations
+
+import math
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+Array = Any
+"""A numpy array or a torch tensor."""
+
+
+def namespace(x: Array) -> ModuleType:
+    """The module, ``torch`` or ``numpy``, whose functions apply to ``x``."""
+    if isinstance(x, (np.ndarray, np.generic, float, int)):
+        return np
+    import torch
+
+    return torch
+
+
+def wrap(angle_rad: Array) -> Array:
+    """``angle_rad`` wrapped into [-pi, pi), elementwise; any shape."""
+    xp = namespace(angle_rad)
+    return xp.remainder(angle_rad + math.pi, 2 * math.pi) - math.pi
+
+
+def select(values: Array, index: Array) -> Array:
+    """``values[..., index]`` elementwise: ``values`` of shape (..., n), integer ``index`` of shape (...), result of shape (...)."""
+    if isinstance(values, np.ndarray):
+        return np.take_along_axis(values, np.asarray(index)[..., None], axis=-1)[..., 0]
+    return values.gather(-1, index.unsqueeze(-1)).squeeze(-1)
+
+
+def one_where(condition: Array, chosen: Array, other: Array) -> Array:
+    """``where`` for vectors: ``condition`` of shape (...), ``chosen`` and ``other`` of shape (..., n)."""
+    return namespace(condition).where(condition[..., None], chosen, other)

@@ -1,0 +1,76 @@
+"""From settings to a cell: URDF -> arm -> 5 mm grid -> annulus fit -> :class:`Cell`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from marl_handover.cell.cell import Cell, mirrored_pair
+from marl_handover.cell.chart import Chart
+from marl_handover.cell.kinematics import ArmModel
+from marl_handover.cell.spaces import AnnulusFit, ManipulationGrid, fit_annulus, manipulation_grid
+from marl_handover.cell.urdf import read_urdf
+from marl_handover.compose import from_yaml, to_yaml
+from marl_handover.config import CellConfig, require_at_least, require_between, require_choice, require_positive
+from marl_handover.resources import resource_path
+
+
+class CellModel(NamedTuple):
+    """A cell with everything it was computed from."""
+
+    cell: Cell
+    arm: ArmModel
+    grid: ManipulationGrid
+    fit: AnnulusFit
+
+
+def urdf_path(urdf: str) -> Path:
+    """A URDF by path, or by the name of a shipped one."""
+    path = Path(urdf)
+    return path if path.exists() or path.parent != Path() else resource_path(f"urdf/{urdf}")
+
+
+def build_cell(config: CellConfig) -> CellModel:
+    """Compute the cell of ``config``.
+
+    Raises:
+        InvalidSetting, MissingFile, UrdfError, NoSharedSpace: where a setting, the URDF or the geometry cannot be.
+    """
+    for name in ("base_distance_mm", "pick_height_mm", "grid_mm"):
+        require_positive(f"cell.{name}", getattr(config, name))
+    require_at_least("cell.fit_rounding_mm", config.fit_rounding_mm, 0)
+    require_between("cell.chart_inset", config.chart_inset, 0.1, 1)
+    arm = ArmModel(read_urdf(urdf_path(config.urdf), config.grasp_link), config.joint_limits_deg)
+    bases = mirrored_pair(config.base_distance_mm)
+    grid = manipulation_grid(arm, config, [(base.x_mm, base.y_mm, base.facing_rad) for base in bases])
+    fit = fit_annulus(grid, config.fit_rounding_mm)
+    Chart(fit.r_min_mm, fit.r_max_mm, config.base_distance_mm, config.chart_inset)
+    cell = Cell(bases, fit.r_min_mm, fit.r_max_mm, (fit.yaw_lower_rad, fit.yaw_upper_rad), config)
+    return CellModel(cell, arm, grid, fit)
+
+
+def cell_config(name: str) -> CellConfig:
+    """Settings of a shipped cell by name, or of a YAML file by path.
+
+    Raises:
+        UnknownChoice, MissingFile, CorruptFile: if there is none.
+    """
+    path = Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        folder = resource_path("configs/cell")
+        require_choice("cell", name, tuple(sorted(file.stem for file in folder.glob("*.yaml"))))
+        path = folder / f"{name}.yaml"
+    config: CellConfig = from_yaml(CellConfig, path)
+    return config
+
+
+_CELLS: dict[str, Cell] = {}
+
+
+def load_cell(cell: str | CellConfig = "paper") -> Cell:
+    """The cell of a shipped name, a YAML path or settings; computed once for each."""
+    config = cell_config(cell) if isinstance(cell, str) else cell
+    key = to_yaml(config)
+    if key not in _CELLS:
+        _CELLS[key] = build_cell(config).cell
+    return _CELLS[key]

@@ -1,0 +1,209 @@
+"""Forward and closed-form inverse kinematics of an arm of the class yaw + planar 3R + roll.
+
+A joint vector is q = (base_yaw, shoulder, elbow, wrist_pitch, wrist_roll) in rad. Frames: ``base`` lies on the table under the yaw axis,
+``grip`` is the grasp frame. ``T_a_b`` takes coordinates in b to coordinates in a; translations are in mm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_handover.arrays import wrap
+from marl_handover.cell.urdf import ARM_JOINTS, ArmDescription, Joint, Vector
+from marl_handover.errors import InvalidSetting, UnknownKey, UnsupportedKinematics
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+LIMIT_TOLERANCE_RAD = 1e-9
+"""Joint values may pass a limit by this much: inverse kinematics at a limit are exact only up to rounding."""
+
+_GEOMETRY_TOLERANCE = 1e-6  # mm or a unit vector's components: well below any machining, well above float rounding
+_AXES: dict[str, Vector] = {
+    "base_yaw": (0.0, 0.0, 1.0),
+    "shoulder": (0.0, -1.0, 0.0),
+    "elbow": (0.0, -1.0, 0.0),
+    "wrist_pitch": (0.0, -1.0, 0.0),
+    "wrist_roll": (1.0, 0.0, 0.0),
+}
+
+
+def transform(xyz_mm: Sequence[float], rpy_rad: Sequence[float]) -> Floats:
+    """The (4, 4) transform of a URDF ``<origin>``: roll, pitch and yaw about the fixed x, y and z axes, then the shift."""
+    T: Floats = np.eye(4)
+    x, y, z = (rotation(np.asarray(angle), axis) for angle, axis in zip(rpy_rad, np.eye(3), strict=True))
+    T[:3, :3] = z @ y @ x
+    T[:3, 3] = xyz_mm
+    return T
+
+
+def rotation(angle_rad: Floats, axis: Sequence[float] | Floats) -> Floats:
+    """Rotations (..., 3, 3) by ``angle_rad`` (...) about the unit vector ``axis`` (3,)."""
+    x, y, z = axis
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = np.asarray(angle_rad, dtype=float)[..., None, None]
+    return np.asarray(np.eye(3) + np.sin(angle) * skew + (1.0 - np.cos(angle)) * (skew @ skew))
+
+
+class ArmModel:
+    """Kinematics of one arm; its geometry is read off the URDF.
+
+    Public attributes, arrays read-only: ``description``; ``lower_rad`` and ``upper_rad`` (5,); ``shoulder_mm`` (2,), the shoulder axis in
+    the arm's vertical plane (forward of the yaw axis, up from the table); ``upper_arm_mm``, ``forearm_mm`` and ``tool_mm`` (2,), the
+    vectors shoulder-elbow, elbow-wrist and wrist-grip at zero; ``reach_mm``, a bound on the grip's distance from the yaw axis.
+    """
+
+    def __init__(self, description: ArmDescription, limits_deg: Mapping[str, Sequence[float]] | None = None) -> None:
+        """Build the model; ``limits_deg`` (joint -> [lower, upper] in degrees) replaces the URDF's own limits.
+
+        Raises :class:`UnsupportedKinematics` if the arm is of another class, :class:`UnknownKey` for a joint that is none of the five and
+        :class:`InvalidSetting` for limits that are no two finite, ordered numbers.
+        """
+        self.description = description
+        origins, grip_mm = _check_class(description)
+        limits = _limits(description, limits_deg or {})
+        self.lower_rad, self.upper_rad = _frozen(limits[:, 0]), _frozen(limits[:, 1])
+        self.shoulder_mm = _frozen(origins[1])
+        self.upper_arm_mm, self.forearm_mm = _frozen(origins[2] - origins[1]), _frozen(origins[3] - origins[2])
+        self.tool_mm = _frozen(grip_mm - origins[3])
+        vectors = (self.upper_arm_mm, self.forearm_mm, self.tool_mm)
+        self.reach_mm = abs(float(self.shoulder_mm[0])) + sum(math.hypot(*vector) for vector in vectors)
+        self._origins = {joint.name: transform(joint.xyz_mm, joint.rpy_rad) for joint in description.joints}
+
+    def fk(self, q: ArrayLike) -> Floats:
+        """Grasp frames T_base_grip (..., 4, 4) in mm of joint vectors ``q`` (..., 5) in rad."""
+        q = np.asarray(q, dtype=float)
+        T = np.eye(4)
+        for joint in self.description.chain():
+            T = self._after(joint, T, q, None)
+        return np.broadcast_to(T, (*q.shape[:-1], 4, 4)).copy()
+
+    def link_transforms(self, q: ArrayLike, gripper_mm: float | None = None) -> dict[str, Floats]:
+        """Link name -> T_base_link (..., 4, 4) in mm, for joint vectors ``q`` (..., 5) in rad.
+
+        ``gripper_mm`` is how far each finger is moved from its lower stop; None means fully open, the widest the hand can be.
+        """
+        q = np.asarray(q, dtype=float)
+        frames = {self.description.root: np.eye(4)}
+        for joint in self.description.joints:
+            frames[joint.child] = self._after(joint, frames[joint.parent], q, gripper_mm)
+        return {name: np.broadcast_to(T, (*q.shape[:-1], 4, 4)) for name, T in frames.items()}
+
+    def ik(self, position_mm: ArrayLike, pitch_rad: ArrayLike = 0.0, roll_rad: ArrayLike = 0.0) -> Floats:
+        """Joint vectors (..., 2, 5) in rad that put the grip at ``position_mm`` (..., 3), base frame, turned to face that point.
+
+        ``pitch_rad`` and ``roll_rad`` broadcast against the leading dimensions. Branch 0 bends the forearm down (elbow
+        up), branch 1 bends it up. A row is NaN where the point is out of reach; joint limits are left to :meth:`within_limits`.
+        """
+        position = np.asarray(position_mm, dtype=float)
+        shape = np.broadcast_shapes(position.shape[:-1], np.shape(pitch_rad), np.shape(roll_rad))
+        pitch, roll = np.broadcast_to(np.asarray(pitch_rad, dtype=float), shape), np.broadcast_to(np.asarray(roll_rad, dtype=float), shape)
+        x, y, z = (np.broadcast_to(position[..., axis], shape) for axis in range(3))
+        tool_x, tool_z = self.tool_mm
+        forward = np.hypot(x, y) - (np.cos(pitch) * tool_x - np.sin(pitch) * tool_z) - self.shoulder_mm[0]
+        up = z - (np.sin(pitch) * tool_x + np.cos(pitch) * tool_z) - self.shoulder_mm[1]
+        return np.stack([self._branch(sign, np.arctan2(y, x), forward, up, pitch, roll) for sign in (-1.0, 1.0)], axis=-2)
+
+    def within_limits(self, q: ArrayLike) -> Bools:
+        """Whether joint vectors ``q`` (..., 5) are within the joint limits, up to :data:`LIMIT_TOLERANCE_RAD`; shape (...). NaN is not."""
+        q = np.asarray(q, dtype=float)
+        inside = (q >= self.lower_rad - LIMIT_TOLERANCE_RAD) & (q <= self.upper_rad + LIMIT_TOLERANCE_RAD)
+        return np.asarray(inside.all(axis=-1))
+
+    def _branch(self, sign: float, yaw: Floats, forward: Floats, up: Floats, pitch: Floats, roll: Floats) -> Floats:
+        """One elbow branch (..., 5) of the planar arm whose wrist is (forward, up) mm from the shoulder."""
+        length_1, length_2 = math.hypot(*self.upper_arm_mm), math.hypot(*self.forearm_mm)
+        slope_1, slope_2 = (math.atan2(vector[1], vector[0]) for vector in (self.upper_arm_mm, self.forearm_mm))
+        cosine = (forward**2 + up**2 - length_1**2 - length_2**2) / (2 * length_1 * length_2)
+        # A stretched arm's cosine may come out at 1 + rounding; it is reachable.
+        cosine = np.where(np.abs(cosine) > 1 + 1e-12, np.nan, np.clip(cosine, -1.0, 1.0))
+        bend = sign * np.arccos(cosine)
+        shoulder = np.arctan2(up, forward) - np.arctan2(length_2 * np.sin(bend), length_1 + length_2 * np.cos(bend)) - slope_1
+        elbow = bend + slope_1 - slope_2
+        q = wrap(np.stack([yaw, shoulder, elbow, pitch - shoulder - elbow, roll], axis=-1))
+        for turn in (2 * math.pi, -2 * math.pi):  # limits may reach past half a turn
+            outside = (q < self.lower_rad - LIMIT_TOLERANCE_RAD) | (q > self.upper_rad + LIMIT_TOLERANCE_RAD)
+            fits = (q + turn >= self.lower_rad - LIMIT_TOLERANCE_RAD) & (q + turn <= self.upper_rad + LIMIT_TOLERANCE_RAD)
+            q = np.where(outside & fits, q + turn, q)
+        return np.where(np.isnan(q).any(axis=-1, keepdims=True), np.nan, q)
+
+    def _after(self, joint: Joint, T_base_parent: Floats, q: Floats, gripper_mm: float | None) -> Floats:
+        """T_base_child of one joint."""
+        T = T_base_parent @ self._origins[joint.name]
+        if joint.kind == "fixed":
+            return T
+        if joint.kind == "prismatic":
+            travel = joint.upper if gripper_mm is None else min(joint.lower + gripper_mm, joint.upper)
+            return np.asarray(T @ transform([travel * component for component in joint.axis], (0.0, 0.0, 0.0)))
+        if joint.name not in ARM_JOINTS:  # a hinged finger: taken at its lower stop
+            angle = np.asarray(joint.lower)
+        else:
+            angle = q[..., ARM_JOINTS.index(joint.name)]
+        R_joint = rotation(angle, joint.axis)
+        out = np.broadcast_to(T, np.broadcast_shapes(T.shape, (*R_joint.shape[:-2], 4, 4))).copy()
+        out[..., :3, :3] = T[..., :3, :3] @ R_joint
+        return out
+
+
+def _frozen(values: Floats) -> Floats:
+    values = np.array(values, dtype=float)
+    values.setflags(write=False)
+    return values
+
+
+def _limits(description: ArmDescription, limits_deg: Mapping[str, Sequence[float]]) -> Floats:
+    """Joint limits (5, 2) in rad."""
+    for name in limits_deg:
+        if name not in ARM_JOINTS:
+            raise UnknownKey(f"joint_limits_deg.{name}", [f"joint_limits_deg.{joint}" for joint in ARM_JOINTS])
+    rows = []
+    for name in ARM_JOINTS:
+        joint = description.joint(name)
+        pair = limits_deg.get(name)
+        if pair is None:
+            rows.append((joint.lower, joint.upper))
+            continue
+        if len(pair) != 2 or not all(math.isfinite(value) for value in pair) or pair[0] > pair[1]:
+            raise InvalidSetting(f"joint_limits_deg.{name}", list(pair), "two finite numbers in degrees, [lower, upper], lower first")
+        rows.append((math.radians(pair[0]), math.radians(pair[1])))
+    return np.array(rows)
+
+
+def _check_class(description: ArmDescription) -> tuple[list[Floats], Floats]:
+    """In-plane origins (x, z) in mm at zero of the five joints, and of the grip.
+
+    Raises :class:`UnsupportedKinematics` unless yaw, three parallel pitch joints and roll follow each other in one plane, frames unturned.
+    """
+    T = np.eye(4)
+    origins: list[Floats] = []
+    for joint in description.chain():
+        T = T @ transform(joint.xyz_mm, joint.rpy_rad)
+        where = f"joint {joint.name!r}"
+        if not np.allclose(T[:3, :3], np.eye(3), atol=_GEOMETRY_TOLERANCE):
+            _unsupported(description, f"{where} turns its frame by rpy = {joint.rpy_rad} rad; at zero all frames must be parallel")
+        if joint.kind == "fixed":
+            continue
+        if joint.kind == "prismatic":
+            _unsupported(description, f"{where} is prismatic; it must be revolute")
+        if not np.allclose(joint.axis, _AXES[joint.name], atol=_GEOMETRY_TOLERANCE):
+            _unsupported(description, f"{where} has axis {joint.axis}; it must be {_AXES[joint.name]}")
+        if abs(T[1, 3]) > _GEOMETRY_TOLERANCE:
+            _unsupported(description, f"{where} is {T[1, 3]:g} mm off the arm's plane y = 0")
+        origins.append(T[[0, 2], 3])
+    if abs(origins[0][0]) > _GEOMETRY_TOLERANCE:
+        _unsupported(description, f"joint 'base_yaw' is {origins[0][0]:g} mm off the base frame's z axis")
+    grip_mm = T[:3, 3]
+    if np.any(np.abs(grip_mm[1:] - (0.0, origins[4][1])) > _GEOMETRY_TOLERANCE):
+        _unsupported(description, f"link {description.grasp_link!r} is off the axis of joint 'wrist_roll', so that rolling would move it")
+    for name, vector in (("shoulder to elbow", origins[2] - origins[1]), ("elbow to wrist_pitch", origins[3] - origins[2])):
+        if math.hypot(*vector) < _GEOMETRY_TOLERANCE:
+            _unsupported(description, f"the link from {name} has no length")
+    return origins, grip_mm[[0, 2]]
+
+
+def _unsupported(description: ArmDescription, what: str) -> None:
+    raise UnsupportedKinematics(description.path, f"inverse kinematics need base yaw, a planar 3R arm and wrist roll, but {what}")

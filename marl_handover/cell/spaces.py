@@ -1,0 +1,159 @@
+"""Where on the table each arm can pick and place: a grid computed from the URDF, and the annulus that is fitted to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from marl_handover.cell.collision import ground_clearance_mm, self_clearance_mm
+from marl_handover.cell.kinematics import ArmModel, Bools, Floats
+from marl_handover.config import CellConfig, require_at_least, require_positive
+from marl_handover.errors import InvalidSetting
+
+LENGTH_TOLERANCE_MM = 1e-6
+ANGLE_TOLERANCE_RAD = 1e-9
+
+BasePose = tuple[float, float, float]
+"""A base in the world: x [mm], y [mm], facing [rad], the direction of its frame's +x."""
+
+
+@dataclass(frozen=True, eq=False)
+class ManipulationGrid:
+    """World points on the table and who can reach them.
+
+    ``x_mm`` (nx,) and ``y_mm`` (ny,) are multiples of the grid step; ``masks`` (num_arms, nx, ny) is True where that arm can pick and
+    place. All arrays are read-only.
+    """
+
+    x_mm: Floats
+    y_mm: Floats
+    masks: Bools
+    bases: tuple[BasePose, ...]
+    pick_height_mm: float
+
+    def points_base_mm(self, arm_index: int) -> Floats:
+        """The grid points (nx, ny, 2) in the base frame of one arm."""
+        return points_in_base(np.stack(np.meshgrid(self.x_mm, self.y_mm, indexing="ij"), axis=-1), self.bases[arm_index])
+
+
+@dataclass(frozen=True)
+class AnnulusFit:
+    """The sector of an annulus that stands for an arm's manipulation space.
+
+    Yaw is about the arm's facing. ``false_inside_rate`` is the share of the grid points inside the fit that the arm cannot reach,
+    ``missed_rate`` the share of the points it can reach that lie outside.
+    """
+
+    r_min_mm: float
+    r_max_mm: float
+    yaw_lower_rad: float
+    yaw_upper_rad: float
+    false_inside_rate: float
+    missed_rate: float
+
+
+def points_in_base(points_mm: ArrayLike, base: BasePose) -> Floats:
+    """World points (..., 2) in the frame of a base, whose +x is its facing."""
+    x_mm, y_mm, facing_rad = base
+    dx, dy = (np.asarray(points_mm, dtype=float)[..., axis] - origin for axis, origin in ((0, x_mm), (1, y_mm)))
+    cos, sin = math.cos(facing_rad), math.sin(facing_rad)
+    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)
+
+
+def feasible(arm: ArmModel, points_base_mm: ArrayLike, pick_height_mm: float) -> Bools:
+    """Whether the arm can hold the pin at table points (..., 2) of its base frame with pitch = roll = 0; shape (...).
+
+    That is so if one of the two elbow branches is within the joint limits and keeps all links off each other and off the ground.
+    """
+    points = np.asarray(points_base_mm, dtype=float)
+    position = np.concatenate([points, np.full((*points.shape[:-1], 1), float(pick_height_mm))], axis=-1)
+    q = arm.ik(position)
+    good = arm.within_limits(q)
+    # Collision is the dear part: only branches that passed the limits are looked at.
+    candidates = q[good]
+    clear = ground_clearance_mm(arm, candidates) > 0
+    clear[clear] = self_clearance_mm(arm, candidates[clear]) > 0
+    good[good] = clear
+    return np.asarray(good.any(axis=-1))
+
+
+def manipulation_grid(arm: ArmModel, cell: CellConfig, bases: Sequence[BasePose]) -> ManipulationGrid:
+    """The grid of world points that covers the reach of one ``arm`` standing on each of ``bases``.
+
+    Raises :class:`InvalidSetting` if ``grid_mm`` is not above 0 or ``pick_height_mm`` is not a finite number of at least 0.
+    """
+    require_positive("grid_mm", cell.grid_mm)
+    require_at_least("pick_height_mm", cell.pick_height_mm, 0)
+    axes: list[Floats] = []
+    for axis in range(2):
+        low = math.floor((min(base[axis] for base in bases) - arm.reach_mm) / cell.grid_mm)
+        high = math.ceil((max(base[axis] for base in bases) + arm.reach_mm) / cell.grid_mm)
+        axes.append(cell.grid_mm * np.arange(low, high + 1, dtype=np.float64))
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    masks = np.stack([feasible(arm, points_in_base(points, base), cell.pick_height_mm) for base in bases])
+    for array in (*axes, masks):
+        array.setflags(write=False)
+    return ManipulationGrid(axes[0], axes[1], masks, tuple(bases), float(cell.pick_height_mm))
+
+
+def fit_annulus(grid: ManipulationGrid, rounding_mm: float = 0.0, weight: float = 1000.0) -> AnnulusFit:
+    """Fit one sector of an annulus to the points of all arms together, seen from their bases.
+
+    The radii, then the yaws, are the contiguous run that maximises (reachable points - ``weight`` x unreachable points), in turn until
+    nothing changes. Then the radii are rounded inwards to a multiple of ``rounding_mm`` (0: not at all).
+
+    Raises :class:`InvalidSetting` on ``pick_height_mm`` if no point can be reached, and on ``fit_rounding_mm`` if rounding leaves nothing.
+    """
+    require_at_least("fit_rounding_mm", rounding_mm, 0)
+    points = np.concatenate([grid.points_base_mm(index).reshape(-1, 2) for index in range(len(grid.bases))])
+    good = grid.masks.reshape(-1)
+    if not good.any():
+        limit = "a height at which the arm, its gripper level, reaches part of the table; here it reaches no grid point"
+        raise InvalidSetting("pick_height_mm", grid.pick_height_mm, limit)
+    radius, yaw = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
+    score = np.where(good, 1.0, -weight)
+    yaws = (float(yaw[good].min()), float(yaw[good].max()))
+    radii: tuple[float, float] | None = None
+    for _ in range(20):  # both steps only ever raise the score, so this ends long before
+        inside = _between(yaw, yaws, ANGLE_TOLERANCE_RAD)
+        new_radii = _best_run(radius[inside], score[inside], LENGTH_TOLERANCE_MM)
+        inside = _between(radius, new_radii, LENGTH_TOLERANCE_MM)
+        new_yaws = _best_run(yaw[inside], score[inside], ANGLE_TOLERANCE_RAD)
+        if new_radii == radii and new_yaws == yaws:
+            break
+        radii, yaws = new_radii, new_yaws
+    r_min, r_max = _rounded_inwards(new_radii, rounding_mm)
+    inside = _between(radius, (r_min, r_max), LENGTH_TOLERANCE_MM) & _between(yaw, yaws, ANGLE_TOLERANCE_RAD)
+    false_inside = float(np.mean(~good[inside])) if inside.any() else 0.0
+    return AnnulusFit(r_min, r_max, yaws[0], yaws[1], false_inside, float(np.mean(~inside[good])))
+
+
+def _between(values: Floats, interval: tuple[float, float], tolerance: float) -> Bools:
+    return np.asarray((values >= interval[0] - tolerance) & (values <= interval[1] + tolerance))
+
+
+def _best_run(values: Floats, score: Floats, tolerance: float) -> tuple[float, float]:
+    """The interval between two of ``values`` (n,) whose points have the largest sum of ``score`` (n,); equal values stay together."""
+    order = np.argsort(values)
+    values, score = values[order], score[order]
+    first = np.flatnonzero(np.concatenate([[True], np.diff(values) > tolerance]))
+    last = np.concatenate([first[1:] - 1, [len(values) - 1]])
+    total = np.concatenate([[0.0], np.cumsum(np.add.reduceat(score, first))])
+    before = np.minimum.accumulate(total[:-1])
+    end = int(np.argmax(total[1:] - before))
+    start = int(np.argmin(total[: end + 1]))
+    return float(values[first[start]]), float(values[last[end]])
+
+
+def _rounded_inwards(radii: tuple[float, float], rounding_mm: float) -> tuple[float, float]:
+    if rounding_mm == 0:
+        return radii
+    low = rounding_mm * math.ceil((radii[0] - LENGTH_TOLERANCE_MM) / rounding_mm)
+    high = rounding_mm * math.floor((radii[1] + LENGTH_TOLERANCE_MM) / rounding_mm)
+    if low >= high:
+        raise InvalidSetting("fit_rounding_mm", rounding_mm, f"small against the annulus of {radii[0]:g} to {radii[1]:g} mm")
+    return low, high

@@ -1,0 +1,148 @@
+"""The command line: ``marl-handover COMMAND [key=value ...]``.
+
+This module imports nothing heavy, so that ``--help`` answers at once; a command's module is imported when that command runs.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from marl_handover.errors import BadOverride, HandoverError
+
+PROGRAM = "marl-handover"
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 1, 2, 130, 141
+
+
+class Command(NamedTuple):
+    """Where a command lives. The module also offers ``SCHEMA``, ``ALIASES`` and ``GROUPS``."""
+
+    summary: str
+    module: str
+    function: str = "run"
+
+
+COMMANDS: dict[str, Command] = {
+    "doctor": Command(
+        "versions, devices, cameras and serial ports; what is missing and how to install it", "marl_handover.commands.doctor"
+    ),
+    "workspace": Command("the cell's grid, annulus fit and chart, as JSON and a picture", "marl_handover.commands.workspace"),
+    "plan": Command("solve one problem: the sequence, its cost and every intermediate pose", "marl_handover.commands.plan"),
+    "train": Command("train a supervisor into a run directory", "marl_handover.commands.train"),
+    "evaluate": Command("play episodes with a policy: table, JSON, trace", "marl_handover.commands.evaluate"),
+    "plot": Command("a figure of a run, a trace or a cell", "marl_handover.commands.plot"),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status: 0 done, 1 the work failed, 2 bad input, 130 interrupted, 141 the reader of a pipe left.
+
+    ``debug=true`` among the arguments lets every exception through, with its traceback.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:2], "--help"]
+    name = arguments[0] if arguments else None
+    if name is None or name in ("--help", "-h"):
+        print(_overview(), file=sys.stdout if arguments else sys.stderr)
+        return 0 if arguments else EXIT_BAD_INPUT
+    if name == "--version":
+        print(f"{PROGRAM} {_version()}")
+        return 0
+    if name not in COMMANDS:
+        close = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"did you mean {close[0]!r}? " if close else ""
+        return _fail(PROGRAM, f"unknown command {name!r}; {hint}commands: {', '.join(COMMANDS)}", EXIT_BAD_INPUT)
+    return _guarded(name, arguments[1:])
+
+
+def _guarded(name: str, arguments: list[str]) -> int:
+    """Run a known command; every exception becomes one line and an exit status."""
+    speaker, debug = f"{PROGRAM} {name}", False
+    try:
+        debug, arguments = _take_debug(arguments)
+        status = _dispatch(name, arguments)
+        sys.stdout.flush()  # here, so that a closed pipe shows itself inside this try
+        return status
+    except BrokenPipeError:
+        # The interpreter flushes stdout once more on its way out; let that go nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_BROKEN_PIPE
+    except KeyboardInterrupt:
+        if debug:
+            raise
+        return _fail(speaker, "interrupted", EXIT_INTERRUPTED)
+    except HandoverError as error:
+        if debug:
+            raise
+        return _fail(speaker, str(error), error.exit_status)
+    except Exception as error:
+        if debug:
+            raise
+        return _fail(speaker, f"internal error: {type(error).__name__}: {error}; run again with debug=true to see where", EXIT_FAILED)
+
+
+def _dispatch(name: str, arguments: list[str]) -> int:
+    command = COMMANDS[name]
+    module: Any = importlib.import_module(command.module)
+    from marl_handover.compose import compose, keys_help
+
+    if any(argument in ("--help", "-h") for argument in arguments):
+        print(f"usage: {PROGRAM} {name} [key=value ...]\n\n{command.summary}\n\n{keys_help(module.SCHEMA, module.ALIASES, module.GROUPS)}")
+        return 0
+    for argument in arguments:
+        if argument.startswith("-"):
+            raise BadOverride(argument, "options are written key=value, without dashes; see --help")
+    config = compose(module.SCHEMA, arguments, groups=module.GROUPS, aliases=module.ALIASES)
+    return int(getattr(module, command.function)(config))
+
+
+def _take_debug(arguments: list[str]) -> tuple[bool, list[str]]:
+    """``debug=...`` is a key of every command and of no schema: take it out. The last one counts."""
+    debug, rest = False, []
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if key != "debug" or not equals:
+            rest.append(argument)
+        elif value.lower() in ("true", "false"):
+            debug = value.lower() == "true"
+        else:
+            raise BadOverride(argument, "debug is true or false")
+    return debug, rest
+
+
+def _overview() -> str:
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name.ljust(width)}  {command.summary}" for name, command in COMMANDS.items()]
+    return "\n".join(
+        [
+            f"usage: {PROGRAM} COMMAND [key=value ...]",
+            "",
+            *lines,
+            "",
+            f"{PROGRAM} COMMAND --help shows a command's keys and defaults; debug=true shows the traceback of an error.",
+        ]
+    )
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("marl_handover")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+def _fail(speaker: str, message: str, status: int) -> int:
+    """Print ``message`` as one line on stderr, and pass ``status`` on."""
+    print(f"{speaker}: {' '.join(message.split())}", file=sys.stderr)
+    return status
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,135 @@
+"""``marl-handover doctor``: what is installed, what is plugged in, what is missing and the line that installs it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+CORE = (
+    "numpy",
+    "torch",
+    "torchrl",
+    "tensordict",
+    "gymnasium",
+    "pettingzoo",
+    "scipy",
+    "hydra-core",
+    "omegaconf",
+    "matplotlib",
+    "tensorboard",
+    "tqdm",
+)
+EXTRAS = {"peers": ("stable-baselines3",), "dev": ("pytest", "ruff", "mypy", "import-linter")}
+
+
+@dataclass
+class DoctorConfig:
+    """The doctor takes no keys."""
+
+
+SCHEMA: type = DoctorConfig
+ALIASES: dict[str, str] = {}
+GROUPS: dict[str, dict[str, type]] = {}
+
+
+def run(config: DoctorConfig) -> int:
+    """Print the report. Returns 1 if a package is missing without which nothing works, else 0."""
+    missing = [package for package in CORE if _installed(package) is None]
+    sections = {
+        "system": _system(),
+        "packages": _packages(CORE),
+        "devices": _devices(),
+        "compiler": _compiler(),
+        "cameras": _listed("/dev", "video*", "none found"),
+        "serial ports": _listed("/dev/serial/by-id", "*", "none found"),
+        "extras": _extras(),
+    }
+    for title, lines in sections.items():
+        print(title)
+        for line in lines:
+            print(f"  {line}")
+    if missing:
+        print(f"missing: {', '.join(missing)}; run: pip install marl_handover")
+        return 1
+    return 0
+
+
+def _installed(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _packages(packages: tuple[str, ...]) -> Iterator[str]:
+    for package in packages:
+        yield f"{package:<14} {_installed(package) or 'MISSING'}"
+
+
+def _system() -> Iterator[str]:
+    yield f"marl_handover  {_installed('marl_handover') or 'not installed (running from a checkout)'}"
+    yield f"python         {platform.python_version()} ({sys.executable})"
+    yield f"platform       {platform.platform()}"
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    yield f"cores          {usable} usable of {os.cpu_count()}"
+
+
+def _devices() -> Iterator[str]:
+    try:
+        torch: Any = importlib.import_module("torch")
+    except (ImportError, OSError) as error:  # OSError: a shared library that torch needs is not there
+        yield f"torch cannot be imported: {' '.join(str(error).split())}"
+        return
+    yield f"cpu            {torch.get_num_threads()} threads"
+    if not torch.cuda.is_available():
+        yield "cuda           not available; device=cpu is used"
+    for index in range(torch.cuda.device_count()):
+        yield f"cuda:{index}         {torch.cuda.get_device_name(index)}"
+
+
+def _compiler() -> Iterator[str]:
+    """torch.compile needs a C++ compiler and Python's headers; both are often absent on a bare machine."""
+    import sysconfig
+
+    candidates = [os.environ.get("CXX"), "g++", "clang++"]
+    found = next((path for name in candidates if name and (path := shutil.which(name))), None)
+    headers = Path(sysconfig.get_path("include")) / "Python.h"
+    yield f"C++ compiler   {found}" if found else "C++ compiler   none, so torch.compile cannot be used; run: apt install g++"
+    if not headers.is_file():
+        major, minor = sys.version_info[:2]
+        yield f"Python.h       none, so torch.compile cannot be used; run: apt install python{major}.{minor}-dev"
+
+
+def _listed(folder: str, pattern: str, otherwise: str) -> Iterator[str]:
+    """Names only: opening a device could disturb whoever uses it."""
+    found = sorted(Path(folder).glob(pattern)) if Path(folder).is_dir() else []
+    if not found:
+        yield otherwise
+    for path in found:
+        access = (
+            "" if os.access(path, os.R_OK | os.W_OK) else f"  (no permission; run: sudo usermod -aG {_group(path)} $USER, and log in again)"
+        )
+        yield f"{path}{access}"
+
+
+def _group(path: Path) -> str:
+    try:
+        return path.group()
+    except (KeyError, OSError, NotImplementedError):
+        return "dialout"
+
+
+def _extras() -> Iterator[str]:
+    for extra, packages in EXTRAS.items():
+        missing = [package for package in packages if _installed(package) is None]
+        state = f"missing {', '.join(missing)}; run: pip install 'marl_handover[{extra}]'" if missing else "complete"
+        yield f"[{extra}]".ljust(15) + state

@@ -1,0 +1,122 @@
+"""Typed settings. Every default of the package lives here, once; ``configs/*.yaml`` hold named differences only.
+
+Lengths are in mm, angles in the unit of the name's suffix.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from marl_handover.errors import InvalidSetting, UnknownChoice
+
+ARCHITECTURES = ("A", "B")
+LAYOUTS = ("raw", "relative", "object")
+HINDSIGHT = ("none", "final", "future", "episode")
+
+
+@dataclass
+class BlockConfig:
+    """The object: a square block with an upright pin in its centre, by which it is held."""
+
+    side_mm: float = 40.0
+    height_mm: float = 15.0
+    pin_diameter_mm: float = 2.5
+    pin_top_mm: float = 65.0
+    marker_mm: float = 30.0
+
+
+def _paper_limits() -> dict[str, list[float]]:
+    """Joint limits for which the 5 mm grid fits the paper's annulus: the elbow's upper stop gives r_max, the wrist's r_min."""
+    return {
+        "base_yaw": [-90.0, 90.0],
+        "shoulder": [-14.0, 150.0],
+        "elbow": [-168.0, -108.5],
+        "wrist_pitch": [-95.0, 95.0],
+        "wrist_roll": [-90.0, 90.0],
+    }
+
+
+@dataclass
+class CellConfig:
+    """Two mirrored arms of one URDF around a shared piece of table; the defaults are the paper's cell."""
+
+    name: str = "paper"
+    urdf: str = "al5a.urdf"  # a path, or the name of a file in urdf/
+    grasp_link: str = "grip"
+    base_distance_mm: float = 360.0
+    pick_height_mm: float = 45.0
+    joint_limits_deg: dict[str, list[float]] = field(default_factory=_paper_limits)  # replace the URDF's own, joint by joint
+    grid_mm: float = 5.0
+    fit_rounding_mm: float = 1.0  # the fitted radii are rounded inwards to a multiple of this; 0 keeps them as they are
+    chart_inset: float = 1.0  # part of the chart that is used: 1 = all, 0.95 leaves room for placement noise
+    block: BlockConfig = field(default_factory=BlockConfig)
+
+
+@dataclass
+class RewardConfig:
+    """Rewards of architecture B (the paper's r_B), and the weight of the coupled motion reward of its eq. (3)."""
+
+    success: float = 20.0
+    step: float = -1.0
+    failure: float = -30.0
+    motion_weight: float = 0.0  # reward -= motion_weight * path cost [mm] / 100
+
+
+@dataclass
+class NoiseConfig:
+    """Execution noise of every placement: standard deviations per axis."""
+
+    position_mm: float = 0.0
+    yaw_deg: float = 0.0
+
+
+@dataclass
+class TaskConfig:
+    """The decision problem."""
+
+    architecture: str = "B"
+    epsilon_deg: float = 5.0  # allowed orientation error
+    max_steps: int = 20
+    symmetry_order: int = 1  # k: the block looks the same when turned by 360/k degrees
+    layout: str = "relative"
+    position_tolerance_mm: float = 5.0  # "at the goal" after a noisy final placement
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
+        require_choice("architecture", self.architecture, ARCHITECTURES)
+        require_choice("layout", self.layout, LAYOUTS)
+        require_positive("epsilon_deg", self.epsilon_deg)
+        require_positive("position_tolerance_mm", self.position_tolerance_mm)
+        require_at_least("max_steps", self.max_steps, 1)
+        require_at_least("symmetry_order", self.symmetry_order, 1)
+        require_at_least("noise.position_mm", self.noise.position_mm, 0)
+        require_at_least("noise.yaw_deg", self.noise.yaw_deg, 0)
+        require_at_least("reward.motion_weight", self.reward.motion_weight, 0)
+
+
+def require_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    """Raise :class:`UnknownChoice` unless ``value`` is one of ``choices``."""
+    if value not in choices:
+        raise UnknownChoice(name, value, choices)
+
+
+def require_positive(name: str, value: float) -> None:
+    """Raise :class:`InvalidSetting` unless ``value`` is a finite number above zero."""
+    if not (math.isfinite(value) and value > 0):
+        raise InvalidSetting(name, value, "a finite number above 0")
+
+
+def require_at_least(name: str, value: float, least: float) -> None:
+    """Raise :class:`InvalidSetting` unless ``value`` is a finite number not below ``least``."""
+    if not (math.isfinite(value) and value >= least):
+        raise InvalidSetting(name, value, f"a finite number, at least {least:g}")
+
+
+def require_between(name: str, value: float, low: float, high: float) -> None:
+    """Raise :class:`InvalidSetting` unless ``low <= value <= high``."""
+    if not (math.isfinite(value) and low <= value <= high):
+        raise InvalidSetting(name, value, f"between {low:g} and {high:g}")

@@ -1,0 +1,6 @@
+"""Environments: thin skins over the rule book."""
+
+from marl_handover.envs.goal_env import SupervisorGoalEnv
+from marl_handover.envs.supervisor_env import SupervisorEnv
+
+__all__ = ["SupervisorEnv", "SupervisorGoalEnv"]

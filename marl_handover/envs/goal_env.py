@@ -1,0 +1,167 @@
+"""The supervisor's problem as a Gymnasium goal environment: one cell, numpy, ready for any hindsight replay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from marl_handover.arrays import wrap
+from marl_handover.cell import Cell, load_cell
+from marl_handover.config import TaskConfig
+from marl_handover.errors import NotFinite, OutOfReach
+from marl_handover.task.observations import observation_size, observe
+from marl_handover.task.problems import sample_problems
+from marl_handover.task.rules import Outcome, Rules
+
+PROBLEMS_PER_DRAW = 1024
+
+Observation = dict[str, NDArray[np.float32]]
+
+
+class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
+    """One cell.
+
+    ``observation`` is the named layout (``object`` by default: a layout without the goal, since a hindsight buffer swaps only
+    ``desired_goal``); ``achieved_goal`` and ``desired_goal`` are poses in mm, mm, rad. Actions are float32[4] = (final, arm, alpha, beta).
+    ``info`` carries ``feasible``, ``final``, ``transfers``, ``outcome`` and ``is_success``.
+
+    Args:
+        architecture: ``"A"`` or ``"B"``; replaces the task's.
+        cell: the cell; the shipped ``paper`` cell if None.
+        task: the task's settings; the defaults, with layout ``object``, if None.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}
+
+    def __init__(self, architecture: str = "B", cell: Cell | None = None, task: TaskConfig | None = None, render_mode: None = None) -> None:
+        cell = cell or load_cell()
+        task = task or TaskConfig(architecture=architecture, layout="object")
+        task.architecture = architecture
+        self.rules = Rules(cell, task)
+        self.render_mode = render_mode
+        reach = float(max(abs(base.x_mm) for base in cell.bases) + cell.r_max_mm + 1.0)
+        reach_y = float(max(abs(base.y_mm) for base in cell.bases) + cell.r_max_mm + 1.0)
+        high = np.array([reach, reach_y, math.pi], dtype=np.float32)
+        pose_space = gymnasium.spaces.Box(-high, high, dtype=np.float32)
+        width = observation_size(task.layout)
+        self.observation_space = gymnasium.spaces.Dict(
+            observation=gymnasium.spaces.Box(-4.0, 4.0, (width,), dtype=np.float32),
+            achieved_goal=pose_space,
+            desired_goal=gymnasium.spaces.Box(-high, high, dtype=np.float32),
+        )
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), dtype=np.float32)
+        self._pose = self._goal = np.zeros(3)
+        self._previous = np.int64(-1)
+        self._transfers = 0
+        self._drawn: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+
+    def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode. ``options={"state": [x_mm, y_mm, theta_rad], "goal": [...]}`` sets the problem, else it is random.
+
+        Raises:
+            OutOfReach, NotFinite: for a state or goal that cannot be.
+        """
+        super().reset(seed=seed)
+        if seed is not None:
+            self._drawn.clear()
+        start, goal = self._draw()
+        options = options or {}
+        self._pose = self._checked("state", options["state"]) if "state" in options else start
+        self._goal = self._checked("goal", options["goal"]) if "goal" in options else goal
+        self._previous, self._transfers = np.int64(-1), 0
+        return self._observation(), self._info(True, False, Outcome.NONE)
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Execute one command; see :class:`marl_handover.task.rules.Rules`."""
+        if not np.isfinite(action).all():
+            raise NotFinite("action", list(action))
+        left = np.asarray(self.rules.config.max_steps - self._transfers)
+        result = self.rules.step(
+            self._pose, self._goal, self._previous, np.asarray(action, np.float64), transfers_left=left, noise=self._noise()
+        )
+        self._pose, self._previous = result.pose, result.previous_arm
+        self._transfers += int(result.transfers)
+        terminated = bool(result.terminated)
+        truncated = not terminated and self._transfers >= self.rules.config.max_steps
+        outcome = Outcome.TIMEOUT if truncated else Outcome(int(result.outcome))
+        info = self._info(bool(result.feasible), bool(result.command.final), outcome)
+        return self._observation(), float(result.reward), terminated, truncated, info
+
+    def compute_reward(
+        self, achieved_goal: NDArray[np.float32], desired_goal: NDArray[np.float32], info: Mapping[str, Any] | Sequence[Mapping[str, Any]]
+    ) -> Any:
+        """Reward of having achieved one pose when another was desired; vectorised over leading dimensions.
+
+        Args:
+            achieved_goal, desired_goal: (3,) or (n, 3).
+            info: one mapping or one a row, read for ``feasible`` (True if absent) and ``final`` (False if absent).
+
+        Returns:
+            A float, or (n,) rewards.
+        """
+        final, feasible = self._flags(info, np.shape(achieved_goal)[:-1])
+        achieved, desired = np.asarray(achieved_goal, np.float64), np.asarray(desired_goal, np.float64)
+        reward = self.rules.judge(achieved, desired, final, feasible).reward
+        return float(reward) if np.ndim(reward) == 0 else reward
+
+    def compute_terminated(
+        self, achieved_goal: NDArray[np.float32], desired_goal: NDArray[np.float32], info: Mapping[str, Any] | Sequence[Mapping[str, Any]]
+    ) -> Any:
+        """Whether the episode ends there; arguments as in :meth:`compute_reward`. A relabelled transition needs both."""
+        final, feasible = self._flags(info, np.shape(achieved_goal)[:-1])
+        achieved, desired = np.asarray(achieved_goal, np.float64), np.asarray(desired_goal, np.float64)
+        return self.rules.judge(achieved, desired, final, feasible).terminated
+
+    @staticmethod
+    def _flags(info: Any, shape: tuple[int, ...]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        rows = [info] if isinstance(info, Mapping) else list(info)
+        final = np.array([bool(row.get("final", False)) for row in rows])
+        feasible = np.array([bool(row.get("feasible", True)) for row in rows])
+        return np.broadcast_to(final.reshape(-1)[0] if final.size == 1 else final, shape).copy(), np.broadcast_to(
+            feasible.reshape(-1)[0] if feasible.size == 1 else feasible, shape
+        ).copy()
+
+    def _draw(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Next random problem; drawn in blocks, since one batched draw costs as much as one single draw."""
+        if not self._drawn:
+            generator = torch.Generator().manual_seed(int(self.np_random.integers(2**62)))
+            starts, goals = sample_problems(self.rules.cell, PROBLEMS_PER_DRAW, generator)
+            self._drawn = list(zip(starts.numpy(), goals.numpy(), strict=True))
+        return self._drawn.pop()
+
+    def _checked(self, what: str, pose: Sequence[float]) -> NDArray[np.float64]:
+        array = np.asarray(pose, np.float64)
+        if array.shape != (3,) or not np.isfinite(array).all():
+            raise NotFinite(what, list(pose))
+        if not self.rules.cell.reaches(array).any():
+            raise OutOfReach(what, (float(array[0]), float(array[1])), self.rules.cell.r_min_mm, self.rules.cell.r_max_mm)
+        return np.concatenate([array[:2], np.atleast_1d(wrap(array[2]))])
+
+    def _noise(self) -> NDArray[np.float64] | None:
+        if not self.rules.noisy:
+            return None
+        noise = self.rules.config.noise
+        return self.np_random.normal(size=3) * np.array([noise.position_mm, noise.position_mm, math.radians(noise.yaw_deg)])
+
+    def _observation(self) -> Observation:
+        vector = observe(self.rules, self.rules.config.layout, self._pose, self._goal, self._previous)
+        return {
+            "observation": np.asarray(vector, np.float32),
+            "achieved_goal": self._pose.astype(np.float32),
+            "desired_goal": self._goal.astype(np.float32),
+        }
+
+    def _info(self, feasible: bool, final: bool, outcome: Outcome) -> dict[str, Any]:
+        return {
+            "feasible": feasible,
+            "final": final,
+            "transfers": self._transfers,
+            "outcome": outcome.name.lower(),
+            "is_success": outcome is Outcome.SUCCESS,
+        }

@@ -1,0 +1,163 @@
+"""Thousands of cells at once: the supervisor's problem as a batch-locked TorchRL environment."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from marl_handover.cell import Cell, load_cell
+from marl_handover.config import TaskConfig, require_at_least, require_positive
+from marl_handover.task.observations import observation_size, observe
+from marl_handover.task.problems import sample_problems
+from marl_handover.task.rules import Outcome, Rules
+
+
+class SupervisorEnv(EnvBase):
+    """A batch of independent cells under one rule book.
+
+    Besides ``observation`` (the named layout), the tensordict carries the problem itself, so that hindsight can relabel it:
+    ``achieved_goal`` and ``desired_goal`` (num_envs, 3) in mm, mm, rad, ``previous_arm`` (-1 none, 0 L, 1 R), ``epsilon`` in rad, ``transfers`` so
+    far; and under ``next``: ``placed`` (the pose after the commanded transfer), ``feasible``, ``outcome``.
+
+    Args:
+        num_envs: number of cells.
+        cell: the cell; the shipped ``paper`` cell if None.
+        task: the task's settings; the defaults if None.
+        device: device of all tensors.
+        seed: seed of problems and noise.
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        cell: Cell | None = None,
+        task: TaskConfig | None = None,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+    ) -> None:
+        require_at_least("num_envs", num_envs, 1)
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        cell = cell or load_cell()
+        self.rules = Rules(cell, task or TaskConfig())
+        self.generator = torch.Generator(device=self.device)
+        self.epsilon_range_rad = (self.rules.epsilon_rad, self.rules.epsilon_rad)
+        self._make_specs()
+        self.set_seed(seed)
+
+    def _make_specs(self) -> None:
+        count, device = self.batch_size[0], self.device
+        width = observation_size(self.rules.config.layout)
+        pose = Unbounded(shape=(count, 3), device=device)
+        problem = {
+            "observation": Unbounded(shape=(count, width), device=device),
+            "achieved_goal": pose,
+            "desired_goal": pose.clone(),
+            "previous_arm": Bounded(-1, self.rules.cell.num_arms - 1, shape=(count, 1), dtype=torch.int64, device=device),
+            "epsilon": Unbounded(shape=(count, 1), device=device),
+            "transfers": Unbounded(shape=(count, 1), dtype=torch.int64, device=device),
+            "placed": pose.clone(),
+            "feasible": Binary(shape=(count, 1), dtype=torch.bool, device=device),
+            "outcome": Bounded(0, max(Outcome), shape=(count, 1), dtype=torch.int64, device=device),
+        }
+        self.observation_spec = Composite(problem, shape=self.batch_size, device=device)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(count, 4), device=device)
+        self.reward_spec = Unbounded(shape=(count, 1), device=device)
+        flag = Binary(shape=(count, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=self.batch_size, device=device)
+
+    def set_epsilon_range(self, low_deg: float, high_deg: float) -> None:
+        """Draw each new episode's epsilon log-uniformly from this range, in degrees."""
+        require_positive("epsilon low", low_deg)
+        require_at_least("epsilon high", high_deg, low_deg)
+        self.epsilon_range_rad = (math.radians(low_deg), math.radians(high_deg))
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.generator.manual_seed(seed)
+
+    def draw_epsilon(self, count: int) -> Tensor:
+        """``count`` values of epsilon in rad, as new episodes get them."""
+        low, high = self.epsilon_range_rad
+        if low == high:
+            return torch.full((count,), low, device=self.device)
+        return torch.empty(count, device=self.device).uniform_(math.log(low), math.log(high), generator=self.generator).exp_()
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        fresh = self.batch_size[0] if mask is None else int(mask.sum())
+        pose, goal = sample_problems(self.rules.cell, fresh, self.generator, torch.float32)
+        epsilon = self.draw_epsilon(fresh)
+        previous = torch.full((fresh,), -1, device=self.device)
+        observation = observe(self.rules, self.rules.config.layout, pose, goal, previous, epsilon)
+        zero = torch.zeros(fresh, 1, dtype=torch.int64, device=self.device)
+        new = {
+            "observation": observation,
+            "achieved_goal": pose,
+            "desired_goal": goal,
+            "previous_arm": zero - 1,
+            "epsilon": epsilon[:, None],
+            "transfers": zero,
+            "placed": pose,
+            "feasible": torch.ones_like(zero, dtype=torch.bool),
+            "outcome": zero,
+        }
+        if mask is None or fresh == self.batch_size[0]:
+            return TensorDict({key: value.clone() for key, value in new.items()}, self.batch_size, device=self.device)
+        rows = mask.reshape(-1)
+        for key, value in new.items():
+            whole = value.new_zeros(self.batch_size + value.shape[1:])  # TorchRL takes only the reset rows
+            whole[rows] = value
+            new[key] = whole
+        return TensorDict(new, self.batch_size, device=self.device)
+
+    def _noise(self) -> Tensor | None:
+        if not self.rules.noisy:
+            return None
+        noise = self.rules.config.noise
+        scale = torch.tensor([noise.position_mm, noise.position_mm, math.radians(noise.yaw_deg)], device=self.device)
+        return torch.randn(self.batch_size[0], 3, generator=self.generator, device=self.device) * scale
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        pose, goal = tensordict["achieved_goal"], tensordict["desired_goal"]
+        epsilon, transfers = tensordict["epsilon"][:, 0], tensordict["transfers"]
+        limit = self.rules.config.max_steps
+        result = self.rules.step(
+            pose,
+            goal,
+            tensordict["previous_arm"][:, 0],
+            tensordict["action"],
+            transfers_left=limit - transfers[:, 0],
+            epsilon_rad=epsilon,
+            noise=self._noise(),
+        )
+        transfers = transfers + result.transfers[:, None]
+        terminated = result.terminated[:, None]
+        truncated = (transfers >= limit) & ~terminated
+        outcome = torch.where(truncated, int(Outcome.TIMEOUT), result.outcome[:, None])
+        observation = observe(self.rules, self.rules.config.layout, result.pose, goal, result.previous_arm, epsilon)
+        return TensorDict(
+            {
+                "observation": observation,
+                "achieved_goal": result.pose,
+                "desired_goal": goal,
+                "previous_arm": result.previous_arm[:, None],
+                "epsilon": tensordict["epsilon"],
+                "transfers": transfers,
+                "placed": result.placed,
+                "feasible": result.feasible[:, None],
+                "outcome": outcome,
+                "reward": result.reward[:, None],
+                "done": terminated | truncated,
+                "terminated": terminated,
+                "truncated": truncated,
+            },
+            self.batch_size,
+            device=self.device,
+        )

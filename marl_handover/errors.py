@@ -1,0 +1,130 @@
+"""Named errors that carry the value, the limit and the valid choices.
+
+Every error a user can cause derives from :class:`HandoverError`; the command line prints its message as one line and exits with ``exit_status``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+
+class HandoverError(Exception):
+    """Base of all errors of this package. Attribute ``exit_status``: 2 for bad input, 1 for work that failed."""
+
+    exit_status = 2
+
+
+class WorkFailed(HandoverError):
+    """The input was fine, but the work could not be done."""
+
+    exit_status = 1
+
+
+class InvalidSetting(HandoverError):
+    """A setting has a value outside its limits."""
+
+    def __init__(self, name: str, value: Any, limit: str) -> None:
+        super().__init__(f"{name} = {value!r}: must be {limit}")
+        self.name, self.value, self.limit = name, value, limit
+
+
+class UnknownChoice(HandoverError):
+    """A name is none of the valid choices."""
+
+    def __init__(self, name: str, value: Any, choices: Iterable[str]) -> None:
+        self.name, self.value, self.choices = name, value, tuple(choices)
+        super().__init__(f"{name} = {value!r} is not known; choose one of: {', '.join(self.choices)}")
+
+
+class UnknownKey(HandoverError):
+    """A configuration key that does not exist."""
+
+    def __init__(self, key: str, choices: Iterable[str]) -> None:
+        self.key, self.choices = key, tuple(choices)
+        super().__init__(f"unknown key {key!r}; valid keys: {', '.join(self.choices)}")
+
+
+class BadOverride(HandoverError):
+    """A ``key=value`` argument that cannot be read."""
+
+    def __init__(self, text: str, reason: str) -> None:
+        super().__init__(f"cannot read {text!r}: {reason}")
+        self.text, self.reason = text, reason
+
+
+class MissingFile(HandoverError):
+    """A file or folder that was named is not there."""
+
+    def __init__(self, what: str, path: Path | str, fix: str = "check the path") -> None:
+        super().__init__(f"{what} not found: {path}; {fix}")
+        self.what, self.path, self.fix = what, Path(path), fix
+
+
+class CorruptFile(HandoverError):
+    """A file is there but cannot be read as what it should be."""
+
+    def __init__(self, what: str, path: Path | str, reason: str) -> None:
+        super().__init__(f"{what} {path} cannot be read: {reason}")
+        self.what, self.path, self.reason = what, Path(path), reason
+
+
+class UrdfError(HandoverError):
+    """A URDF lacks a link or joint that the cell needs, or is malformed."""
+
+    def __init__(self, path: Path | str, problem: str) -> None:
+        super().__init__(f"URDF {path}: {problem}")
+        self.path, self.problem = Path(path), problem
+
+
+class UnsupportedKinematics(UrdfError):
+    """The arm is not of the class yaw + planar 3R + roll, for which the inverse kinematics are closed-form."""
+
+
+class NoSharedSpace(HandoverError):
+    """The two annuli do not overlap in one connected piece."""
+
+    def __init__(self, base_distance_mm: float, r_min_mm: float, r_max_mm: float, reason: str = "") -> None:
+        self.base_distance_mm, self.r_min_mm, self.r_max_mm = base_distance_mm, r_min_mm, r_max_mm
+        because = reason or (
+            f"half of it must lie between r_min = {r_min_mm:g} mm and r_max = {r_max_mm:g} mm; "
+            f"choose base_distance_mm between {2 * r_min_mm:g} and {2 * r_max_mm:g}"
+        )
+        super().__init__(f"no connected shared space at base_distance_mm = {base_distance_mm:g}: {because}")
+
+
+class OutOfReach(HandoverError):
+    """A position that no arm can reach."""
+
+    def __init__(self, what: str, position_mm: tuple[float, float], r_min_mm: float, r_max_mm: float) -> None:
+        self.what, self.position_mm = what, position_mm
+        self.r_min_mm, self.r_max_mm = r_min_mm, r_max_mm
+        super().__init__(
+            f"{what} ({position_mm[0]:g}, {position_mm[1]:g}) mm is out of every arm's reach; "
+            f"it must lie {r_min_mm:g} to {r_max_mm:g} mm from a base, within the arm's yaw range"
+        )
+
+
+class NotFinite(HandoverError):
+    """A number that must be finite is NaN or infinite."""
+
+    def __init__(self, what: str, value: Any) -> None:
+        super().__init__(f"{what} = {value}: every number must be finite")
+        self.what, self.value = what, value
+
+
+class CheckpointMismatch(HandoverError):
+    """A checkpoint was made for other settings than the ones asked for."""
+
+    def __init__(self, path: Path | str, key: str, stored: Any, wanted: Any) -> None:
+        super().__init__(f"checkpoint {path} has {key} = {stored!r}, but {wanted!r} was asked for")
+        self.path, self.key, self.stored, self.wanted = Path(path), key, stored, wanted
+
+
+class MissingDependency(HandoverError):
+    """An optional package is not installed."""
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(f"{package} is not installed; run: pip install 'marl_handover[{extra}]'")
+        self.package, self.extra = package, extra

@@ -1,0 +1,1 @@
+"""Training the supervisor: algorithms, hindsight replay, trainer, evaluation on the batched rules."""

@@ -1,0 +1,165 @@
+"""Judging a policy on the batched rules: the numbers, file formats and confidence intervals of ``evaluate``."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from marl_handover.arrays import wrap
+from marl_handover.errors import CorruptFile, MissingFile, NotFinite, OutOfReach
+from marl_handover.learning.rollout import Act, Episodes, Noise, Observer, play
+from marl_handover.task.planner import ExactPlanner
+from marl_handover.task.problems import sample_problems
+from marl_handover.task.rules import Outcome, Rules
+
+Floats = NDArray[np.float64]
+
+EVALUATION_SEED = 1_000_000_000
+"""Problems of reports come from seeds from here on; training and its validation use others, so these are never seen."""
+
+TIMED_DECISIONS = 1000
+CHUNK = 1000
+
+
+def random_problems(rules: Rules, count: int, seed: int) -> tuple[Floats, Floats]:
+    """Starts and goals (count, 3) of evaluation seed ``seed``."""
+    generator = torch.Generator().manual_seed(EVALUATION_SEED + seed)
+    start, goal = sample_problems(rules.cell, count, generator)
+    return start.numpy(), goal.numpy()
+
+
+def read_problems(rules: Rules, path: Path) -> tuple[Floats, Floats]:
+    """Problems of a JSON Lines file of ``{"state": [x_mm, y_mm, theta_rad], "goal": [...]}``, all lines, in order.
+
+    Raises:
+        MissingFile, CorruptFile, NotFinite, OutOfReach: with the line's number.
+    """
+    if not path.is_file():
+        raise MissingFile("problems file", path)
+    poses: dict[str, list[Floats]] = {"state": [], "goal": []}
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            row = json.loads(line)
+            values = {key: np.array(row[key], float).reshape(3) for key in poses}
+        except (ValueError, KeyError, TypeError) as error:
+            raise CorruptFile("problems file", path, f"line {number} is not {{'state': [3 numbers], 'goal': [3 numbers]}}") from error
+        for key, value in values.items():
+            what = f"{key} in line {number} of {path}"
+            if not np.isfinite(value).all():
+                raise NotFinite(what, value.tolist())
+            if not rules.cell.reaches(value).any():
+                raise OutOfReach(what, (value[0], value[1]), rules.cell.r_min_mm, rules.cell.r_max_mm)
+            poses[key].append(np.concatenate([value[:2], np.atleast_1d(wrap(value[2]))]))
+    if not poses["state"]:
+        raise CorruptFile("problems file", path, "it holds no problem")
+    return np.stack(poses["state"]), np.stack(poses["goal"])
+
+
+def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson score interval of a proportion, 95 % by default."""
+    if trials == 0:
+        return 0.0, 1.0
+    share = successes / trials
+    centre = (share + z * z / (2 * trials)) / (1 + z * z / trials)
+    half = z / (1 + z * z / trials) * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+@dataclass
+class Evaluation:
+    """A policy's result on a set of problems. ``optimal`` is 0 where no plan exists within the step limit."""
+
+    episodes: Episodes
+    optimal: NDArray[np.int64]
+    decision_us: tuple[float, float]
+    wall_s: float
+
+    def report(self) -> dict[str, Any]:
+        """The counts and statistics of ``evaluate json=FILE``."""
+        outcome, steps = self.episodes.outcome, self.episodes.transfers
+        solved = outcome == int(Outcome.SUCCESS)
+        count, successes = len(outcome), int(solved.sum())
+        low, high = wilson_interval(successes, count)
+        known = solved & (self.optimal > 0)
+        return {
+            "episodes": count,
+            "success_rate": successes / count,
+            "success_ci95": [low, high],
+            "mean_steps": float(steps.mean()),
+            "mean_steps_success": float(steps[solved].mean()) if successes else None,
+            "optimal_mean_steps": float(self.optimal[self.optimal > 0].mean()),
+            "steps_ratio": float((steps[known] / self.optimal[known]).mean()) if known.any() else None,
+            "outcomes": {kind.name.lower(): int((outcome == int(kind)).sum()) for kind in Outcome if kind is not Outcome.NONE},
+            "decision_us": {"p50": self.decision_us[0], "p99": self.decision_us[1]},
+            "wall_s": self.wall_s,
+        }
+
+
+def evaluate(
+    rules: Rules,
+    act: Act,
+    problems: tuple[Floats, Floats],
+    seed: int = 0,
+    observer: Observer | None = None,
+    progress: Callable[[int], object] = lambda done: None,
+) -> Evaluation:
+    """Play all problems (n, 3), (n, 3) with a batched numpy policy, in chunks, and time single decisions.
+
+    Args:
+        rules: the rule book to be judged by.
+        act: the policy.
+        problems: starts and goals.
+        seed: of execution noise.
+        observer: sees every decision, with episode numbers over all problems.
+        progress: called with the number of problems a chunk finished.
+    """
+    started = time.perf_counter()
+    noise = placement_noise(rules, seed)
+    parts = []
+    for first in range(0, len(problems[0]), CHUNK):
+        start, goal = problems[0][first : first + CHUNK], problems[1][first : first + CHUNK]
+        shifted = None if observer is None else _shifted(observer, first)
+        parts.append(play(rules, act, start, goal, noise=noise, observer=shifted))
+        progress(len(start))
+    episodes = Episodes(*(np.concatenate([part[index] for part in parts]) for index in range(3)))
+    optimal = ExactPlanner(rules).plan(*problems).transfers
+    return Evaluation(episodes, optimal, decision_time(act, problems), time.perf_counter() - started)
+
+
+def _shifted(observer: Observer, first: int) -> Observer:
+    return lambda decision: observer(decision._replace(episode=decision.episode + first))
+
+
+def placement_noise(rules: Rules, seed: int) -> Noise | None:
+    """Gaussian placement noise as the task's settings say, or None on exact hardware."""
+    if not rules.noisy:
+        return None
+    settings = rules.config.noise
+    scale = np.array([settings.position_mm, settings.position_mm, math.radians(settings.yaw_deg)])
+    generator = np.random.default_rng(seed)
+    return lambda count: generator.normal(size=(count, 3)) * scale
+
+
+def decision_time(act: Act, problems: tuple[Floats, Floats]) -> tuple[float, float]:
+    """Median and 99th percentile, in microseconds, of one decision for one problem: pose in, action out."""
+    elapsed = []
+    none = np.int64(-1)
+    for index in range(-20, min(TIMED_DECISIONS, max(len(problems[0]), 100))):
+        row = index % len(problems[0])
+        begun = time.perf_counter_ns()
+        act(problems[0][row], problems[1][row], none)
+        if index >= 0:  # the first ones warm up
+            elapsed.append(time.perf_counter_ns() - begun)
+    p50, p99 = np.percentile(elapsed, [50, 99]) / 1e3
+    return float(p50), float(p99)

@@ -1,0 +1,85 @@
+"""From a trained algorithm to plain arrays: one ``.npz`` that :mod:`marl_handover.policies` evaluates without torch."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from marl_handover.cell import load_cell
+from marl_handover.errors import CorruptFile
+from marl_handover.learning.algorithm import Algorithm
+from marl_handover.learning.checkpoint import FILE, load_checkpoint
+from marl_handover.learning.factory import make_algorithm
+from marl_handover.learning.settings import ALGORITHMS, SacConfig, TrainConfig
+from marl_handover.task.rules import Rules
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def policy_arrays(algorithm: Algorithm, config: TrainConfig, origin: str) -> Arrays:
+    """Weights of the deterministic policy, float32, and ``about``: JSON of what it is and which settings it was trained with.
+
+    Args:
+        algorithm: the trained algorithm.
+        config: its settings.
+        origin: where the weights come from, such as a run directory and step.
+    """
+    linear = [module for module in algorithm.actor().modules() if isinstance(module, nn.Linear)]
+    about: dict[str, Any] = {
+        "kind": algorithm.kind,
+        "layout": config.algorithm.layout,
+        "cell": asdict(config.cell),
+        "task": asdict(config.task),
+        "variant": config.variant,
+        "layers": len(linear),
+        "origin": origin,
+    }
+    if isinstance(config.algorithm, SacConfig):
+        about |= {key: getattr(config.algorithm, key) for key in ("modes", "canonical", "harmonics")}
+    arrays: Arrays = {"about": np.array(json.dumps(about))}
+    for index, layer in enumerate(linear):
+        arrays[f"weight_{index}"] = layer.weight.detach().cpu().numpy().T.astype(np.float32)
+        arrays[f"bias_{index}"] = layer.bias.detach().cpu().numpy().astype(np.float32)
+    return arrays
+
+
+def save_policy(path: Path, arrays: Arrays) -> None:
+    """Write a policy file as a whole."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("wb") as stream:
+        np.savez(stream, **arrays)  # type: ignore[arg-type]
+    temporary.replace(path)
+
+
+def run_arrays(folder: Path) -> Arrays:
+    """The policy of a run directory's checkpoint.
+
+    Raises:
+        MissingFile, CorruptFile, CheckpointMismatch: see :func:`load_checkpoint`.
+    """
+    state = load_checkpoint(folder)
+    try:
+        config = train_config(state["config"], folder / FILE)
+        config.device, config.compile = "cpu", "off"
+        config.task.layout = config.algorithm.layout
+        rules = Rules(load_cell(config.cell), config.task)
+        algorithm = make_algorithm(rules, config, torch.Generator())
+        algorithm.load_state_dict(state["algorithm"])
+    except (KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise CorruptFile("checkpoint", folder / FILE, f"its parts do not fit together ({str(error).splitlines()[0]})") from error
+    return policy_arrays(algorithm, config, f"{folder} at step {state['counters']['step']}")
+
+
+def train_config(text: str, path: Path) -> TrainConfig:
+    """The settings stored in a checkpoint as YAML text."""
+    from marl_handover.compose import from_text
+
+    config: TrainConfig = from_text(TrainConfig, text, path, {"algorithm": ALGORITHMS})
+    return config

@@ -1,0 +1,282 @@
+"""Hybrid SAC: soft actor-critic for a choice (arm, final, place mode) with a continuous place (alpha, beta) in some of its branches.
+
+The expectation over the branches is exact: V = sum_i p_i [Q_i - a_place log pi_i(place)] - a_branch sum_i p_i log p_i, where the final branches have no
+place. Two temperatures, one for each kind of choice. Besides the soft gradient, the actor's mean is drawn towards the best of a few random places
+wherever the critic finds that place better by a margin: gradients alone leave some states in a poor local optimum, and a deterministic policy then
+cycles there for ever.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.objectives.common import LossModule
+
+from marl_handover.learning.algorithm import Algorithm, compiled
+from marl_handover.learning.networks import AfterstateCritic, Branches, HybridActor, arm_blocks
+from marl_handover.learning.settings import SacConfig, TrainConfig
+from marl_handover.task.observations import observe
+from marl_handover.task.rules import Command, Rules
+
+
+EDGE = 1.15
+"""Random places are drawn from a chart this much too large and brought back to its edge."""
+
+
+class SoftValue(NamedTuple):
+    """Soft value (n,) of a policy, with what it was made of."""
+
+    value: Tensor
+    probability: Tensor  # (n, arms, 1 + modes)
+    branch_entropy: Tensor  # (n,)
+    place_log_prob: Tensor  # (n, arms, modes)
+
+
+def squashed_sample(branches: Branches, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Reparametrised places (n, arms, modes, 2) in (-1, 1) and their log-densities (n, arms, modes)."""
+    raw = branches.mean + branches.log_std.exp() * noise
+    log_prob = -0.5 * noise.square() - branches.log_std - 0.5 * math.log(2 * math.pi)
+    # log(1 - tanh(x)^2), stable at saturation
+    log_prob = log_prob - 2 * (math.log(2) - raw - F.softplus(-2 * raw))
+    return raw.tanh(), log_prob.sum(-1)
+
+
+class HybridSacLoss(LossModule):
+    """The three losses, over one batch of judged transitions (see :class:`HindsightReplayBuffer`)."""
+
+    actor: HybridActor
+    critic: AfterstateCritic
+    target: AfterstateCritic
+
+    def __init__(self, rules: Rules, actor: HybridActor, critic: AfterstateCritic, target: AfterstateCritic, config: SacConfig) -> None:
+        super().__init__()
+        self.rules, self.config = rules, config
+        self.actor, self.critic, self.target = actor, critic, target
+        start = math.log(config.initial_temperature)
+        self.log_temperatures = nn.Parameter(torch.tensor([start, start]))  # of places, of branches
+
+    def afterstates(self, pose: Tensor, goal: Tensor, place: Tensor, epsilon: Tensor) -> Tensor:
+        """What follows if each arm placed at ``place`` (n, arms, m, 2): blocks (n, arms, m, 2, fields), the acting arm's first."""
+        arms = self.rules.cell.num_arms
+        shape = place.shape[:-1]
+        arm = torch.arange(arms, device=place.device)[:, None].expand(shape)
+        command = Command(
+            torch.zeros(shape, dtype=torch.bool, device=place.device), arm, self.rules.cell.chart.to_table(place[..., 0], place[..., 1])
+        )
+        goal = goal[:, None, None].expand(*shape, 3)
+        placed, _ = self.rules.transfer(pose[:, None, None].expand(*shape, 3), goal, command)
+        blocks = arm_blocks(observe(self.rules, "relative", placed, goal, arm, epsilon[:, None, None].expand(shape)))
+        return torch.stack([blocks[:, index].roll(-index, -2) for index in range(arms)], 1)
+
+    def soft_value(self, critic: AfterstateCritic, batch: dict[str, Tensor], noise: Tensor) -> SoftValue:
+        """Soft value of the present policy under ``critic``, from ``pose``, ``goal``, ``epsilon`` and ``observation``."""
+        branches = self.actor(batch["observation"])
+        place, place_log_prob = squashed_sample(branches, noise)
+        following = self.afterstates(batch["pose"], batch["goal"], place, batch["epsilon"])
+        place_value = critic.value_place(following).amin(0)
+        final_value = critic.value_final(arm_blocks(batch["observation"])).amin(0)
+        temperature = self.log_temperatures.detach().exp()
+        log_probability = branches.logits.flatten(1).log_softmax(-1).view_as(branches.logits)
+        probability = log_probability.exp()
+        branch_entropy = -(probability * log_probability).sum((-2, -1))
+        value = (
+            (probability[..., 1:] * (place_value - temperature[0] * place_log_prob)).sum((-2, -1))
+            + (probability[..., 0] * final_value).sum(-1)
+            + temperature[1] * branch_entropy
+        )
+        return SoftValue(value, probability, branch_entropy, place_log_prob)
+
+    def critic_loss(self, batch: dict[str, Tensor], following: dict[str, Tensor], noise: Tensor) -> Tensor:
+        """Squared error of both critics on the branch that was taken, summed over the two."""
+        with torch.no_grad():
+            future = self.soft_value(self.target, following, noise).value
+            alive = torch.where(following["terminated"], 0.0, 1.0)
+            target = self.config.reward_scale * following["reward"] + self.config.gamma * alive * future
+        blocks, after = arm_blocks(batch["observation"]), arm_blocks(following["observation"])
+        second = batch["arm"][:, None, None] == 1
+        own = torch.where(second, blocks.flip(-2), blocks)[:, 0]
+        after = torch.where(second, after.flip(-2), after)
+        value = torch.where(batch["final"], self.critic.value_final(own), self.critic.value_place(after))
+        return (value - target).square().mean(1).sum()
+
+    def actor_loss(self, batch: dict[str, Tensor], noise: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Loss of the actor, then the mean branch entropy and the mean place entropy, for the temperatures."""
+        soft = self.soft_value(self.critic, batch, noise)
+        weight = soft.probability[..., 1:].detach()
+        place_entropy = -(weight * soft.place_log_prob).sum() / weight.sum().clamp_min(1e-6)
+        loss = -soft.value.mean()
+        if candidates.shape[2]:
+            loss = loss + self.config.candidate_weight * self._candidate_loss(batch, candidates)
+        return loss, soft.branch_entropy.mean().detach(), place_entropy.detach()
+
+    def _candidate_loss(self, batch: dict[str, Tensor], candidates: Tensor) -> Tensor:
+        """Squared distance of each arm's nearest mode to the best of ``candidates`` (n, arms, m, 2), weighted by how much better it is."""
+        mean = self.actor(batch["observation"]).mean.tanh()
+        modes = mean.shape[2]
+        with torch.no_grad():
+            places = torch.cat([mean, candidates], 2)
+            value = self.critic.value_place(self.afterstates(batch["pose"], batch["goal"], places, batch["epsilon"])).amin(0)
+            best_value, best = value[..., modes:].max(-1)
+            target = candidates.gather(2, best[..., None, None].expand(-1, -1, 1, 2))
+            nearest = (mean - target).square().sum(-1).argmin(-1)
+            weight = (best_value - value[..., :modes].amax(-1) - self.config.candidate_margin).clamp(0.0, 1.0)
+        chosen = mean.gather(2, nearest[..., None, None].expand(-1, -1, 1, 2))
+        return (weight * (chosen - target).square().sum((-2, -1))).sum(-1).mean()
+
+    def temperature_loss(self, branch_entropy: Tensor, place_entropy: Tensor, targets: tuple[float, float]) -> Tensor:
+        """Raises a temperature whose entropy (of places, of branches) is below its target."""
+        surplus = torch.stack([place_entropy - targets[0], branch_entropy - targets[1]])
+        return (self.log_temperatures.exp() * surplus).sum()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """``loss_qvalue`` and ``loss_actor`` of a sampled batch, TorchRL style; training uses the parts above."""
+        batch, following = unpacked(tensordict)
+        shape = (len(tensordict), self.rules.cell.num_arms, self.actor.modes, 2)
+        noise = torch.randn(2, *shape, device=tensordict.device)
+        candidates = torch.zeros(*shape[:2], 0, 2, device=tensordict.device)
+        critic = self.critic_loss(batch, following, noise[0])
+        actor, branch, place = self.actor_loss(batch, noise[1], candidates)
+        return TensorDict({"loss_qvalue": critic, "loss_actor": actor, "entropy_branch": branch, "entropy_place": place})
+
+
+def unpacked(batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Plain dictionaries, cheap to compile over, of a sampled batch: the present and what followed."""
+    present = {
+        "observation": batch["observation"],
+        "pose": batch["achieved_goal"],
+        "goal": batch["desired_goal"],
+        "epsilon": batch["epsilon"][:, 0],
+        "arm": batch["arm"][:, 0],
+        "final": batch["final"][:, 0],
+    }
+    following = {
+        "observation": batch["next", "observation"],
+        "pose": batch["next", "achieved_goal"],
+        "goal": batch["desired_goal"],
+        "epsilon": batch["epsilon"][:, 0],
+        "reward": batch["next", "reward"][:, 0],
+        "terminated": batch["next", "terminated"][:, 0],
+    }
+    return present, following
+
+
+class HybridSac(Algorithm):
+    """Networks, optimisers and temperatures around :class:`HybridSacLoss`."""
+
+    kind = "hybrid"
+    config: SacConfig
+
+    def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
+        super().__init__(rules, config, generator)
+        own = self.config
+        can_finish = not rules.external_finish
+        actor = HybridActor(rules.cell, own.actor_hidden, own.modes, can_finish, own.canonical, own.harmonics).to(self.device)
+        critic = AfterstateCritic(own.critic_hidden, own.canonical, own.harmonics).to(self.device)
+        target = AfterstateCritic(own.critic_hidden, own.canonical, own.harmonics).to(self.device).requires_grad_(False)
+        target.load_state_dict(critic.state_dict())
+        self.loss = HybridSacLoss(rules, actor, critic, target, own).to(self.device)
+        adam: dict[str, Any] = {"lr": own.learning_rate, "fused": True}
+        self.actor_optimizer = torch.optim.Adam(actor.parameters(), **adam)
+        self.critic_optimizer = torch.optim.Adam(critic.parameters(), **adam)
+        self.temperature_optimizer = torch.optim.Adam([self.loss.log_temperatures], lr=own.temperature_rate)
+        self._critic_loss = compiled(self.loss.critic_loss, config.compile)
+        self._actor_loss = compiled(self.loss.actor_loss, config.compile)
+        self.targets = self._targets(0.0)
+
+    def _targets(self, fraction: float) -> tuple[float, float]:
+        """Target entropies of places and branches; they fall until ``entropy_until`` so that the last policies are nearly deterministic."""
+        own, done = self.config, min(1.0, fraction / self.config.entropy_until)
+        place = own.place_entropy_start + done * (own.place_entropy_end - own.place_entropy_start)
+        branch = own.branch_entropy_start * (own.branch_entropy_end / own.branch_entropy_start) ** done
+        return place, branch
+
+    def schedule(self, fraction: float) -> None:
+        """Learning rate and target entropies."""
+        super().schedule(fraction)
+        for group in self.temperature_optimizer.param_groups:
+            group["lr"] = self.config.temperature_rate
+        self.targets = self._targets(fraction)
+
+    def actor(self) -> nn.Module:
+        """The policy network."""
+        return self.loss.actor
+
+    def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
+        """The loss module holds all networks and the temperatures."""
+        return {
+            "loss": self.loss,
+            "actor_optimizer": self.actor_optimizer,
+            "critic_optimizer": self.critic_optimizer,
+            "temperature_optimizer": self.temperature_optimizer,
+        }
+
+    @torch.no_grad()
+    def explore(self, observation: Tensor) -> Tensor:
+        """A branch and a place drawn from the policy."""
+        branches = self.loss.actor(observation)
+        place, _ = squashed_sample(branches, self._noise(branches.mean.shape))
+        uniform = torch.rand(branches.logits.flatten(1).shape, generator=self.generator, device=self.device)
+        gumbel = -(-uniform.clamp_min(1e-20).log()).log()
+        blind = torch.rand(place.shape[:-1], generator=self.generator, device=self.device) < self.config.random_place
+        place = torch.where(blind[..., None], self._anywhere(place.shape), place)
+        return chosen_action(branches.logits, place, gumbel)
+
+    @torch.no_grad()
+    def act(self, observation: Tensor) -> Tensor:
+        """The likeliest branch and its mean place."""
+        branches = self.loss.actor(observation)
+        return chosen_action(branches.logits, branches.mean.tanh())
+
+    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """One step of the critics, the actor, the temperatures and the target."""
+        present, following = unpacked(batch)
+        shape = (len(batch), self.rules.cell.num_arms, self.config.modes, 2)
+        critic_loss = self._critic_loss(present, following, self._noise(shape))
+        self._step(self.critic_optimizer, critic_loss)
+        candidates = self._anywhere((*shape[:2], self.config.candidates, 2))
+        actor_loss, branch_entropy, place_entropy = self._actor_loss(present, self._noise(shape), candidates)
+        self._step(self.actor_optimizer, actor_loss)
+        self._step(self.temperature_optimizer, self.loss.temperature_loss(branch_entropy, place_entropy, self.targets))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.loss.target.parameters()), list(self.loss.critic.parameters()), self.config.tau)
+        return {
+            "loss_critic": critic_loss.detach(),
+            "loss_actor": actor_loss.detach(),
+            "entropy_branch": branch_entropy,
+            "entropy_place": place_entropy,
+            "temperature_place": self.loss.log_temperatures.detach()[0].exp(),
+            "temperature_branch": self.loss.log_temperatures.detach()[1].exp(),
+        }
+
+    @staticmethod
+    def _step(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    def _anywhere(self, shape: tuple[int, ...]) -> Tensor:
+        """Chart coordinates spread evenly, with a share exactly on the edge, where the largest turns are made."""
+        uniform = torch.rand(shape, generator=self.generator, device=self.device) * 2 - 1
+        return (uniform * EDGE).clamp(-1.0, 1.0)
+
+    def _noise(self, shape: tuple[int, ...]) -> Tensor:
+        return torch.randn(shape, generator=self.generator, device=self.device)
+
+
+def chosen_action(logits: Tensor, place: Tensor, noise: Tensor | None = None) -> Tensor:
+    """Actions (n, 4) of the branch with the largest logit, after adding ``noise`` to the flattened logits.
+
+    ``logits`` (n, arms, 1 + modes); ``place`` (n, arms, modes, 2).
+    """
+    flat = logits.flatten(1) if noise is None else logits.flatten(1) + noise
+    branch = flat.argmax(-1)
+    arm, choice = branch // logits.shape[-1], branch % logits.shape[-1]
+    rows = torch.arange(len(logits), device=logits.device)
+    where = place[rows, arm, (choice - 1).clamp_min(0)]
+    final = torch.where(choice == 0, 1.0, -1.0)
+    return torch.cat([torch.stack([final, 2.0 * arm - 1.0], -1), where], -1)

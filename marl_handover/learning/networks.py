@@ -1,0 +1,171 @@
+"""Networks of the supervisor. Small on purpose: good features and few gradient steps win (method section 4)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from marl_handover.cell import Cell
+from marl_handover.task.observations import ARM_FIELDS, ODD_FIELDS
+
+LOG_STD_RANGE = (-6.0, 1.0)
+
+
+def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
+    """Linear layers with ReLU between: (..., inputs) -> (..., outputs)."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), nn.ReLU()]
+        inputs = width
+    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
+
+
+class TwinMLP(nn.Module):
+    """Two scalar networks of one shape with layer norm, evaluated in one batched product: (n, inputs) -> (2, n)."""
+
+    def __init__(self, inputs: int, hidden: Sequence[int]) -> None:
+        super().__init__()
+        widths = [inputs, *hidden, 1]
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for fan_in, fan_out in zip(widths[:-1], widths[1:], strict=True):
+            bound = 1 / math.sqrt(fan_in)
+            self.weights.append(nn.Parameter(torch.empty(2, fan_in, fan_out).uniform_(-bound, bound)))
+            self.biases.append(nn.Parameter(torch.empty(2, 1, fan_out).uniform_(-bound, bound)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Both networks' values."""
+        x = x.expand(2, *x.shape)
+        last = len(self.weights) - 1
+        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = torch.baddbmm(bias, x, weight)
+            if index < last:
+                x = F.relu(F.layer_norm(x, (x.shape[-1],)))
+        return x[..., 0]
+
+
+class Mirror(nn.Module):
+    """Folds the symmetry M_x: turns each arm's block so that the sine of its hand-over angle is never negative."""
+
+    odd: Tensor
+
+    def __init__(self, enabled: bool) -> None:
+        super().__init__()
+        self.enabled = enabled
+        self.index = ARM_FIELDS.index("sin_hand_over")
+        odd = torch.tensor([-1.0 if name in ODD_FIELDS else 1.0 for name in ARM_FIELDS])
+        self.register_buffer("odd", odd, persistent=False)
+
+    def forward(self, blocks: Tensor) -> tuple[Tensor, Tensor]:
+        """Blocks (..., m, fields) are turned by the sign, (..., 1), of their first block; both are returned."""
+        first = blocks[..., 0, self.index : self.index + 1]
+        sign = torch.where(first < 0, -1.0, 1.0) if self.enabled else torch.ones_like(first)
+        return torch.where(sign[..., None] < 0, blocks * self.odd, blocks), sign
+
+
+ANGLES = (("cos_finish_error", "sin_finish_error"), ("cos_hand_over", "sin_hand_over"))
+
+
+class Harmonics(nn.Module):
+    """Appends the cosines and sines of 2, 4, ... 2^count times each angle of a block, for sharper functions of it."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.count = count
+        self.index = [(ARM_FIELDS.index(cosine), ARM_FIELDS.index(sine)) for cosine, sine in ANGLES]
+        self.width = len(ARM_FIELDS) + 2 * len(ANGLES) * count
+
+    def forward(self, blocks: Tensor) -> Tensor:
+        """Blocks (..., fields) -> (..., width)."""
+        parts = [blocks]
+        for cosine_index, sine_index in self.index:
+            cosine, sine = blocks[..., cosine_index], blocks[..., sine_index]
+            for _ in range(self.count):
+                cosine, sine = cosine.square() - sine.square(), 2 * sine * cosine
+                parts.append(torch.stack([cosine, sine], -1))
+        return torch.cat(parts, -1)
+
+
+class Branches(NamedTuple):
+    """What the actor says of every branch. Branch 0 of an arm is final, the others are its place modes.
+
+    Attributes:
+        logits: (n, num_arms, 1 + modes).
+        mean: (n, num_arms, modes, 2), of (alpha, beta) before the tanh, in table coordinates.
+        log_std: like ``mean``.
+    """
+
+    logits: Tensor
+    mean: Tensor
+    log_std: Tensor
+
+
+def arm_blocks(observation: Tensor) -> Tensor:
+    """The ``relative`` layout (..., num_arms * fields) as one block an arm (..., num_arms, fields)."""
+    return observation.unflatten(-1, (-1, len(ARM_FIELDS)))
+
+
+class HybridActor(nn.Module):
+    """One network for both arms, each seeing the problem in its own mirrored frame.
+
+    Args:
+        cell: the cell, for the arms' mirror signs.
+        hidden: widths.
+        modes: place modes an arm.
+        can_finish: whether there is a final branch (architecture B); without one its logit is minus infinity.
+        canonical: fold the symmetry M_x.
+        harmonics: see :class:`Harmonics`.
+    """
+
+    beta_sign: Tensor
+
+    def __init__(self, cell: Cell, hidden: Sequence[int], modes: int, can_finish: bool, canonical: bool, harmonics: int) -> None:
+        super().__init__()
+        self.modes, self.can_finish = modes, can_finish
+        self.mirror, self.harmonics = Mirror(canonical), Harmonics(harmonics)
+        self.net = mlp(self.harmonics.width, hidden, 1 + 5 * modes)
+        if modes > 1:  # start the modes apart, so that they do not learn the same thing
+            with torch.no_grad():
+                self.net[-1].bias[1 + modes : 1 + 3 * modes : 2] = torch.linspace(-0.8, 0.8, modes)
+        self.register_buffer("beta_sign", torch.tensor([float(base.mirror) for base in cell.bases]), persistent=False)
+
+    def forward(self, observation: Tensor) -> Branches:
+        """Branches of observations (n, size) of the ``relative`` layout."""
+        blocks, sign = self.mirror(arm_blocks(observation).unsqueeze(-2))
+        out = self.net(self.harmonics(blocks.squeeze(-2)))
+        modes = self.modes
+        logits = out[..., : 1 + modes]
+        if not self.can_finish:
+            logits = torch.cat([torch.full_like(logits[..., :1], -1e9), logits[..., 1:]], -1)
+        mean = out[..., 1 + modes : 1 + 3 * modes].unflatten(-1, (modes, 2))
+        log_std = out[..., 1 + 3 * modes :].unflatten(-1, (modes, 2)).clamp(*LOG_STD_RANGE)
+        signs = torch.stack([sign.expand(mean.shape[:-1]), self.beta_sign[:, None].expand(mean.shape[:-1])], -1)
+        return Branches(logits, mean * signs, log_std)
+
+
+class AfterstateCritic(nn.Module):
+    """Twin values of the branches.
+
+    Where an arm puts the object is known from kinematics, so the value of placing it is read off the observation that *follows* (the acting arm's
+    block first), and the value of finishing off the acting arm's present block.
+    """
+
+    def __init__(self, hidden: Sequence[int], canonical: bool, harmonics: int) -> None:
+        super().__init__()
+        self.mirror, self.harmonics = Mirror(canonical), Harmonics(harmonics)
+        self.place = TwinMLP(2 * self.harmonics.width, hidden)
+        self.final = TwinMLP(self.harmonics.width, hidden)
+
+    def value_place(self, following: Tensor) -> Tensor:
+        """Values (2, ...) of afterstates (..., 2, fields): the acting arm's block, then the other's."""
+        blocks, _ = self.mirror(following)
+        return self.place(self.harmonics(blocks).flatten(-2).flatten(0, -2)).unflatten(-1, following.shape[:-2])
+
+    def value_final(self, block: Tensor) -> Tensor:
+        """Values (2, ...) of finishing, from the acting arm's blocks (..., fields)."""
+        blocks, _ = self.mirror(block.unsqueeze(-2))
+        return self.final(self.harmonics(blocks.squeeze(-2)).flatten(0, -2)).unflatten(-1, block.shape[:-1])

@@ -1,0 +1,90 @@
+"""PPO on the boxed action, with TorchRL's clipped loss and generalised advantages."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from marl_handover.learning.algorithm import Algorithm
+from marl_handover.learning.box import ACTIONS, box_spec
+from marl_handover.learning.networks import mlp
+from marl_handover.learning.settings import PpoConfig, TrainConfig
+from marl_handover.task.observations import observation_size
+from marl_handover.task.rules import Rules
+
+
+class Ppo(Algorithm):
+    """On-policy: :meth:`update` takes a whole roll-out (num_envs, time)."""
+
+    kind = "box"
+    on_policy = True
+    config: PpoConfig
+
+    def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
+        super().__init__(rules, config, generator)
+        inputs = observation_size(rules.config.layout)
+        self.net = mlp(inputs, self.config.hidden, 2 * ACTIONS).to(self.device)
+        parameters = TensorDictModule(nn.Sequential(self.net, NormalParamExtractor()), in_keys=["observation"], out_keys=["loc", "scale"])
+        self.policy = ProbabilisticActor(
+            parameters, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True, spec=box_spec(self.device)
+        )
+        value = ValueOperator(mlp(inputs, self.config.hidden, 1).to(self.device), in_keys=["observation"])
+        self.loss = ClipPPOLoss(
+            self.policy,
+            value,
+            clip_epsilon=self.config.clip,
+            entropy_coeff=self.config.entropy,
+            normalize_advantage=True,
+            functional=False,
+        ).to(self.device)
+        self.advantage = GAE(gamma=self.config.gamma, lmbda=self.config.gae_lambda, value_network=value)
+        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=self.config.learning_rate)
+
+    def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
+        """Loss module (actor and value) and optimiser."""
+        return {"loss": self.loss, "optimizer": self.optimizer}
+
+    def actor(self) -> nn.Module:
+        """The network from observation to action parameters; its first four outputs are the mean before the tanh."""
+        return self.net
+
+    @torch.no_grad()
+    def explore(self, observation: Tensor) -> Tensor:
+        """An action drawn from the policy."""
+        loc, scale = NormalParamExtractor()(self.net(observation))
+        # Kept off the walls of the box, where the density of a tanh-Gaussian is not finite.
+        noise = torch.randn(loc.shape, generator=self.generator, device=self.device)
+        return (loc + scale * noise).tanh().clamp(-1 + 1e-6, 1 - 1e-6)
+
+    @torch.no_grad()
+    def act(self, observation: Tensor) -> Tensor:
+        """The mean action."""
+        return self.net(observation)[..., :ACTIONS].tanh()
+
+    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """``epochs`` passes over the roll-out in minibatches. Each pass counts as one gradient step a minibatch."""
+        batch["next", "reward"] = batch["next", "reward"] * self.config.reward_scale
+        with torch.no_grad():
+            batch["action_log_prob"] = self.policy.get_dist(batch).log_prob(batch["action"])
+            self.advantage(batch)
+        flat = batch.reshape(-1)
+        size = self.config.batch_size
+        losses = {}
+        for _ in range(self.config.epochs):
+            order = torch.randperm(len(flat), generator=self.generator, device=self.device)
+            for rows in order.split(size):
+                losses = self.loss(flat[rows])
+                self.optimizer.zero_grad()
+                (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
+                nn.utils.clip_grad_norm_(self.loss.parameters(), self.config.max_grad_norm)
+                self.optimizer.step()
+        return {"loss_critic": losses["loss_critic"].detach(), "loss_actor": losses["loss_objective"].detach()}
+
+    def gradient_steps(self, transitions: int) -> int:
+        """Gradient steps that :meth:`update` takes on a roll-out of so many transitions."""
+        return self.config.epochs * -(-transitions // self.config.batch_size)

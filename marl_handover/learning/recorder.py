@@ -1,0 +1,95 @@
+"""What a training run writes while it runs: metrics.csv, TensorBoard events, a progress bar."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+COLUMNS = (
+    "step",
+    "gradient_step",
+    "wall_s",
+    "episodes",
+    "epsilon_low_deg",
+    "epsilon_high_deg",
+    "success_rate",
+    "mean_steps",
+    "steps_ratio",
+    "training_success_rate",
+    "learning_rate",
+    "loss_critic",
+    "loss_actor",
+    "entropy_place",
+    "entropy_branch",
+    "temperature_place",
+    "temperature_branch",
+)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file so that a reader sees the old one or the new one, never half of it."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("w", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(path)
+
+
+class Recorder:
+    """Rows of ``metrics.csv`` and their TensorBoard twins, and a bar with ETA, success rate and epsilon.
+
+    Args:
+        folder: the run directory.
+        total_steps: environment steps of the run.
+        start_step: step the run continues from; later rows of an interrupted run are dropped.
+        progress: show the bar.
+    """
+
+    def __init__(self, folder: Path, total_steps: int, start_step: int = 0, progress: bool = True) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.path = folder / "metrics.csv"
+        self._keep_until(start_step)
+        self.board = SummaryWriter(str(folder), purge_step=start_step + 1 if start_step else None)
+        self.bar = tqdm(total=total_steps, initial=start_step, unit="step", disable=not progress, dynamic_ncols=True)
+
+    def _keep_until(self, step: int) -> None:
+        """Rewrite the table with its header and the rows up to ``step``."""
+        rows: list[list[str]] = []
+        if step and self.path.exists():
+            with self.path.open(newline="", encoding="utf-8") as stream:
+                rows = [row for row in list(csv.reader(stream))[1:] if len(row) == len(COLUMNS) and int(row[0]) <= step]
+        lines = [",".join(COLUMNS), *(",".join(row) for row in rows)]
+        write_whole(self.path, "\n".join(lines) + "\n")
+
+    def progress(self, step: int, **shown: Any) -> None:
+        """Move the bar."""
+        self.bar.update(step - self.bar.n)
+        if shown:
+            self.bar.set_postfix(shown)
+
+    def record(self, row: dict[str, float]) -> None:
+        """Append one row; values that a run does not have stay empty."""
+        values = [_text(row.get(name)) for name in COLUMNS]
+        with self.path.open("a", encoding="utf-8") as stream:
+            stream.write(",".join(values) + "\n")
+        for name, value in row.items():
+            if name != "step" and math.isfinite(value):
+                self.board.add_scalar(name, value, int(row["step"]))
+
+    def close(self) -> None:
+        """Flush the events and end the bar."""
+        self.board.close()
+        self.bar.close()
+
+
+def _text(value: float | None) -> str:
+    if value is None or not math.isfinite(value):
+        return ""
+    return str(int(value)) if float(value).is_integer() else f"{value:.6g}"

@@ -1,0 +1,272 @@
+"""The training loop: collect, relabel, update, evaluate, save; any algorithm."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from marl_handover.cell import load_cell
+from marl_handover.compose import to_yaml
+from marl_handover.envs.supervisor_env import SupervisorEnv
+from marl_handover.errors import CheckpointMismatch, InvalidSetting
+from marl_handover.learning.checkpoint import load_checkpoint, save_checkpoint
+from marl_handover.learning.curriculum import Curriculum
+from marl_handover.learning.factory import make_algorithm
+from marl_handover.learning.recorder import Recorder, write_whole
+from marl_handover.learning.replay import EpisodeWriter, HindsightReplayBuffer
+from marl_handover.learning.rollout import play
+from marl_handover.learning.settings import OffPolicyConfig, PpoConfig, TrainConfig
+from marl_handover.task.observations import observe
+from marl_handover.task.planner import ExactPlanner
+from marl_handover.task.problems import sample_problems
+from marl_handover.task.rules import Outcome
+
+VALIDATION_SEED = 2_000_000_000
+"""Seeds of the problems that a run is watched on start here; reports use others (:mod:`marl_handover.learning.evaluation`)."""
+
+
+@dataclass
+class Counters:
+    """How far a run is."""
+
+    step: int = 0
+    gradient_step: int = 0
+    episodes: int = 0
+    wall_s: float = 0.0
+    stage: int = 0
+    next_evaluation: int = 0
+    next_checkpoint: int = 0
+
+
+class Trainer:
+    """One training run in one directory.
+
+    Args:
+        config: validated settings.
+        folder: the run directory, made if it is not there.
+    """
+
+    def __init__(self, config: TrainConfig, folder: Path) -> None:
+        config.validate()
+        self.config, self.folder = config, folder
+        self.device = usable_device(config.device)
+        torch.set_num_threads(config.threads)
+        torch.manual_seed(config.seed)
+        self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
+        self.env = SupervisorEnv(config.num_envs, load_cell(config.cell), config.task, self.device, seed=config.seed + 1)
+        self.rules = self.env.rules
+        self.algorithm = make_algorithm(self.rules, config, self.generator)
+        self.curriculum = Curriculum(config.curriculum, self.env)
+        self.counters = Counters(next_evaluation=config.evaluation_interval, next_checkpoint=config.checkpoint_interval)
+        self.replay = HindsightReplayBuffer(self.rules, config.replay, self.env, self.generator)
+        self.writer = EpisodeWriter(config.num_envs, config.task.max_steps, self.device)
+        self.rollout: list[TensorDictBase] = []
+        self.recent = torch.zeros(2)  # finished and solved episodes since the last evaluation
+        self.losses: dict[str, Tensor] = {}
+        self.last: dict[str, float] = {}
+        self.current: TensorDictBase | None = None
+
+    def run(self) -> dict[str, Any]:
+        """Train to the end; return (and write) the summary. Interrupting it saves a checkpoint first."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_whole(self.folder / "config.yaml", to_yaml(self.config))
+        recorder = Recorder(self.folder, self.config.steps, self.counters.step, self.config.progress)
+        started = time.perf_counter() - self.counters.wall_s
+        if self.current is None:
+            self.curriculum.enter(self.counters.stage)
+            self.current = self.env.reset()
+        try:
+            while self.counters.step < self.config.steps:
+                self._advance()
+                self.counters.wall_s = time.perf_counter() - started
+                self._report(recorder)
+        except KeyboardInterrupt:
+            self.save()
+            raise
+        finally:
+            recorder.close()
+        self.save()
+        return self._summarise()
+
+    def _advance(self) -> None:
+        """One environment step of every cell, and the gradient steps that are due."""
+        config = self.config.algorithm
+        assert self.current is not None
+        blind = isinstance(config, OffPolicyConfig) and self.counters.step < config.learning_starts
+        observation = self.current["observation"]
+        if blind:
+            action = torch.rand(len(observation), 4, generator=self.generator, device=self.device) * 2 - 1
+        else:
+            action = self.algorithm.explore(observation)
+        self.current["action"] = action
+        transition, self.current = self.env.step_and_maybe_reset(self.current)
+        self.counters.step += self.config.num_envs
+        done = transition["next", "done"]
+        solved = (transition["next", "outcome"] == int(Outcome.SUCCESS)) & done
+        self.recent += torch.stack([done.sum(), solved.sum()]).cpu()
+        self.counters.episodes += int(done.sum())
+        self.algorithm.schedule(self.counters.step / self.config.steps)
+        if isinstance(config, OffPolicyConfig):
+            self._learn_from_replay(transition, config)
+        elif isinstance(config, PpoConfig):
+            self._learn_from_rollout(transition, config)
+
+    def _learn_from_replay(self, transition: TensorDictBase, config: OffPolicyConfig) -> None:
+        finished = self.writer.add(transition)
+        if finished is not None:
+            self.replay.extend(finished)
+        due = int((self.counters.step - config.learning_starts) / config.steps_per_update) - self.counters.gradient_step
+        if due <= 0 or len(self.replay) < config.batch_size:
+            return
+        # One draw for all updates that are due: a draw costs as much as an update.
+        batches = self.replay.sample_transitions(due * config.batch_size).split(config.batch_size)
+        for batch in batches:
+            self.losses = self.algorithm.update(batch)
+        self.counters.gradient_step += due
+
+    def _learn_from_rollout(self, transition: TensorDictBase, config: PpoConfig) -> None:
+        kept = transition.select(
+            "observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated")
+        )
+        self.rollout.append(kept)
+        if len(self.rollout) == config.rollout_steps:
+            batch = TensorDict.stack(self.rollout, 1)
+            self.losses = self.algorithm.update(batch)
+            self.counters.gradient_step += config.epochs * math.ceil(batch.numel() / config.batch_size)
+            self.rollout = []
+
+    def _report(self, recorder: Recorder) -> None:
+        counters = self.counters
+        if counters.step >= counters.next_evaluation or counters.step >= self.config.steps:
+            counters.next_evaluation += self.config.evaluation_interval
+            self.last = self.evaluate()
+            recorder.record(self._row())
+            self.recent.zero_()
+            self._advance_curriculum()
+        shown = {"success": f"{100 * self.last['success_rate']:.2f}%"} if self.last else {}
+        recorder.progress(counters.step, **shown, epsilon=self.curriculum.label)
+        if counters.step >= counters.next_checkpoint:
+            counters.next_checkpoint += self.config.checkpoint_interval
+            self.save()
+
+    def _advance_curriculum(self) -> None:
+        stage = self.curriculum.stage_after(self.counters.stage, self.counters.step, self.last["success_rate"])
+        if stage != self.counters.stage:
+            self.counters.stage = stage
+            self.curriculum.enter(stage)
+
+    def _row(self) -> dict[str, float]:
+        counters, (low, high) = self.counters, self.env.epsilon_range_rad
+        finished, solved = self.recent.tolist()
+        rate = next(part.param_groups[0]["lr"] for part in self.algorithm.modules().values() if isinstance(part, torch.optim.Optimizer))
+        return {
+            "step": counters.step,
+            "gradient_step": counters.gradient_step,
+            "wall_s": counters.wall_s,
+            "episodes": counters.episodes,
+            "epsilon_low_deg": math.degrees(low),
+            "epsilon_high_deg": math.degrees(high),
+            "training_success_rate": solved / finished if finished else math.nan,
+            "learning_rate": rate,
+            **self.last,
+            **{name: float(value) for name, value in self.losses.items()},
+        }
+
+    def evaluate(self) -> dict[str, float]:
+        """Success rate, mean steps and ratio to the optimum of the deterministic policy on the run's own validation problems."""
+        generator = torch.Generator(device=self.device).manual_seed(VALIDATION_SEED + self.config.seed)
+        start, goal = sample_problems(self.rules.cell, self.config.evaluation_episodes, generator, torch.float32)
+        layout, epsilon = self.rules.config.layout, self.rules.epsilon_rad
+
+        def act(pose: Tensor, goal: Tensor, previous: Tensor) -> Tensor:
+            return self.algorithm.act(observe(self.rules, layout, pose, goal, previous, epsilon))
+
+        episodes = play(self.rules, act, start, goal)
+        solved = episodes.outcome == int(Outcome.SUCCESS)
+        optimum = ExactPlanner(self.rules).plan(start.double(), goal.double()).transfers
+        ratio = (episodes.transfers / optimum)[solved]
+        return {
+            "success_rate": float(solved.double().mean()),
+            "mean_steps": float(episodes.transfers.double().mean()),
+            "steps_ratio": float(ratio.double().mean()) if len(ratio) else math.nan,
+        }
+
+    def _summarise(self) -> dict[str, Any]:
+        validation = {key: None if math.isnan(value) else value for key, value in self.last.items()}
+        summary = {**asdict(self.counters), "seed": self.config.seed, "torch": torch.__version__, "validation": validation}
+        write_whole(self.folder / "summary.json", json.dumps(summary, indent=2) + "\n")
+        return summary
+
+    def save(self) -> None:
+        """Write a checkpoint from which :meth:`restore` continues exactly."""
+        rows = self.replay[:].clone().to_dict() if len(self.replay) else None  # a slice would save the whole memory
+        save_checkpoint(
+            self.folder,
+            {
+                "config": to_yaml(self.config),
+                "counters": asdict(self.counters),
+                "algorithm": self.algorithm.state_dict(),
+                "replay": {"rows": rows, "cursor": self.replay._writer._cursor},
+                "episodes": self.writer.state_dict(),
+                "rollout": [step.to_dict() for step in self.rollout],
+                "current": None if self.current is None else self.current.to_dict(),
+                "recent": self.recent,
+                "last": self.last,
+                "random": {
+                    "learner": self.generator.get_state(),
+                    "problems": self.env.generator.get_state(),
+                    "torch": torch.get_rng_state(),
+                },
+            },
+        )
+
+    def restore(self) -> None:
+        """Continue from the directory's checkpoint: networks, optimisers, replay, running episodes, random states, counters."""
+        state = load_checkpoint(self.folder, self.device)
+        stored = state["config"]
+        if _architecture(stored) != self.config.task.architecture:
+            raise CheckpointMismatch(self.folder, "architecture", _architecture(stored), self.config.task.architecture)
+        self.counters = Counters(**state["counters"])
+        self.algorithm.load_state_dict(state["algorithm"])
+        self.writer.load_state_dict(state["episodes"])
+        if state["replay"]["rows"] is not None:
+            rows = TensorDict.from_dict(state["replay"]["rows"], auto_batch_size=True, batch_dims=1)
+            self.replay.extend(rows)
+            self.replay._writer._cursor = state["replay"]["cursor"]
+        self.rollout = [TensorDict.from_dict(step, auto_batch_size=True, batch_dims=1) for step in state["rollout"]]
+        self.curriculum.enter(self.counters.stage)
+        if state["current"] is not None:
+            self.current = TensorDict(state["current"], self.env.batch_size, device=self.device)
+        self.recent, self.last = state["recent"], state["last"]
+        self.generator.set_state(state["random"]["learner"].cpu())
+        self.env.generator.set_state(state["random"]["problems"].cpu())
+        torch.set_rng_state(state["random"]["torch"].cpu())
+
+
+def _architecture(config_yaml: str) -> str:
+    import yaml
+
+    return str(yaml.safe_load(config_yaml)["task"]["architecture"])
+
+
+def usable_device(name: str) -> torch.device:
+    """The device of that name.
+
+    Raises:
+        InvalidSetting: for a name torch does not know or a device this machine does not have.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        found = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+        raise InvalidSetting("device", name, f"one this machine has: {', '.join(found)}") from error
+    return device

@@ -1,0 +1,1 @@
+"""The rule book, problems, observation layouts and the exact planner."""

@@ -1,0 +1,128 @@
+"""Named observation layouts: what a policy sees, as one float vector.
+
+``raw`` is the paper's seven numbers. ``relative`` shows the same problem to each arm in its own mirrored frame, so that one network can
+serve both arms. ``object`` is ``raw`` without the goal, for goal environments whose goal is a field of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from marl_handover.arrays import Array, namespace
+from marl_handover.config import LAYOUTS, require_choice
+from marl_handover.task.rules import Rules
+
+RAW_FIELDS = ("x", "y", "theta", "goal_x", "goal_y", "goal_theta", "previous_arm")
+OBJECT_FIELDS = ("x", "y", "theta", "previous_arm")
+ARM_FIELDS = (
+    "x",
+    "y",
+    "goal_x",
+    "goal_y",
+    "reaches_object",
+    "other_reaches_object",
+    "reaches_goal",
+    "other_reaches_goal",
+    "cos_finish_error",
+    "sin_finish_error",
+    "finish_error_in_epsilons",
+    "cos_hand_over",
+    "sin_hand_over",
+    "other_finish_error_in_epsilons",
+    "was_previous",
+    "other_was_previous",
+    "log_epsilon",
+)
+"""Fields of one arm's block of ``relative``; the vector holds one block an arm, L first.
+
+``finish_error`` is the orientation error this arm would leave if it placed the object at the goal now. ``hand_over`` is the hand-over angle
+psi_own(p) - psi_other(p) at which passing the object at p would let the other arm finish exactly. All are mirrored into the arm's frame.
+"""
+
+ODD_FIELDS = ("x", "goal_x", "sin_finish_error", "finish_error_in_epsilons", "sin_hand_over", "other_finish_error_in_epsilons")
+"""The fields that change sign when the table is mirrored along the base line (M_x); the others stay."""
+
+ERROR_CLIP = 3.0
+"""Errors in units of epsilon are cut off here."""
+
+
+def observation_size(layout: str) -> int:
+    """Length of the layout's vector."""
+    require_choice("layout", layout, LAYOUTS)
+    return {"raw": len(RAW_FIELDS), "object": len(OBJECT_FIELDS), "relative": 2 * len(ARM_FIELDS)}[layout]
+
+
+def observe(rules: Rules, layout: str, pose: Array, goal: Array, previous_arm: Array, epsilon_rad: Array | float | None = None) -> Array:
+    """Observations (..., observation_size(layout)) of a batch: pose and goal (..., 3), previous_arm int (...) with -1 for none."""
+    return _LAYOUTS[layout](rules, pose, goal, previous_arm, rules.epsilon_rad if epsilon_rad is None else epsilon_rad)
+
+
+def _scaled(rules: Rules, pose: Array) -> list[Array]:
+    """Pose fields scaled to about [-1, 1]."""
+    cell = rules.cell
+    extent_y = cell.r_max_mm + cell.config.base_distance_mm / 2
+    return [pose[..., 0] / cell.r_max_mm, pose[..., 1] / extent_y, pose[..., 2] / math.pi]
+
+
+def _previous_sign(rules: Rules, like: Array, previous_arm: Array) -> Array:
+    """-1 for L, +1 for R, 0 for none."""
+    xp = namespace(like)
+    one = xp.ones_like(like)
+    return xp.where(previous_arm < 0, 0 * one, xp.where(previous_arm > 0, one, -one))
+
+
+def _raw(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsilon_rad: Array | float) -> Array:
+    fields = [*_scaled(rules, pose), *_scaled(rules, goal), _previous_sign(rules, pose[..., 0], previous_arm)]
+    return namespace(pose).stack(fields, -1)
+
+
+def _object(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsilon_rad: Array | float) -> Array:
+    return namespace(pose).stack([*_scaled(rules, pose), _previous_sign(rules, pose[..., 0], previous_arm)], -1)
+
+
+def _relative(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsilon_rad: Array | float) -> Array:
+    """One block an arm. Both arms' quantities are computed at once, with the arms on the last axis."""
+    xp, cell = namespace(pose), rules.cell
+    scale = cell.r_max_mm
+    square, yaw = cell.polar(pose)
+    goal_square, goal_yaw = cell.polar(goal)
+    reach = cell.within(square, yaw) + 0.0 * yaw
+    goal_reach = cell.within(goal_square, goal_yaw) + 0.0 * yaw
+    mirror = xp.stack([base.mirror + 0 * pose[..., 0] for base in cell.bases], -1)
+    turn = (pose[..., 2] - goal[..., 2])[..., None]
+    finish = rules.orientation_error(turn + goal_yaw - yaw, 0 * turn)
+    other_goal_psi = xp.flip(cell.gripper_yaw(goal_yaw), (-1,))
+    hand_over = (cell.gripper_yaw(yaw) - turn - other_goal_psi) * rules.config.symmetry_order
+    epsilon = epsilon_rad + 0 * pose[..., 0]
+    in_epsilons = xp.clip(mirror * finish / epsilon[..., None], -ERROR_CLIP, ERROR_CLIP) / ERROR_CLIP
+    was_previous = xp.stack([(previous_arm == index) + 0 * pose[..., 0] for index in range(cell.num_arms)], -1)
+    one = xp.ones_like(yaw)
+    fields = [
+        pose[..., 0:1] / scale * one,
+        mirror * pose[..., 1:2] / scale,
+        goal[..., 0:1] / scale * one,
+        mirror * goal[..., 1:2] / scale,
+        reach,
+        xp.flip(reach, (-1,)),
+        goal_reach,
+        xp.flip(goal_reach, (-1,)),
+        xp.cos(finish * rules.config.symmetry_order),
+        mirror * xp.sin(finish * rules.config.symmetry_order),
+        in_epsilons,
+        xp.cos(hand_over),
+        mirror * xp.sin(hand_over),
+        xp.flip(in_epsilons, (-1,)) * -1,
+        was_previous,
+        xp.flip(was_previous, (-1,)),
+        xp.log(epsilon)[..., None] / 4 * one,
+    ]
+    blocks = xp.stack(fields, -1)
+    return blocks.reshape(*blocks.shape[:-2], -1)
+
+
+_LAYOUTS: dict[str, Callable[[Rules, Array, Array, Array, Array | float], Array]] = {
+    "raw": _raw,
+    "object": _object,
+    "relative": _relative,
+}

@@ -1,0 +1,48 @@
+"""Random problems: start and goal poses, uniform on M x (-pi, pi]."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from marl_handover.cell.cell import Cell
+
+
+def sample_positions(cell: Cell, count: int, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> Tensor:
+    """``count`` positions (count, 2) in mm, uniform on the union of the arms' annulus sectors.
+
+    Draws from a sector chosen at random; a point that an arm of lower index reaches too counts for that arm only and is
+    drawn again, so that the shared space is not twice as dense.
+    """
+    device = generator.device
+    kept: list[Tensor] = []
+    missing = count
+    low, high = cell.r_min_mm**2, cell.r_max_mm**2
+    base = torch.tensor([(b.x_mm, b.y_mm, b.facing_rad) for b in cell.bases], dtype=dtype, device=device)
+    while missing > 0:
+        draw = math.ceil(1.5 * missing) + 8
+        uniform = torch.rand(3, draw, generator=generator, dtype=dtype, device=device)
+        arm = (uniform[0] * cell.num_arms).long().clamp_max(cell.num_arms - 1)
+        radius = (low + uniform[1] * (high - low)).sqrt()
+        angle = base[arm, 2] + cell.yaw_rad[0] + uniform[2] * (cell.yaw_rad[1] - cell.yaw_rad[0])
+        points = base[arm, :2] + radius[:, None] * torch.stack([angle.cos(), angle.sin()], -1)
+        owner = cell.reaches(points).to(torch.uint8).argmax(-1)
+        points = points[owner == arm][:missing]
+        kept.append(points)
+        missing -= len(points)
+    return kept[0] if len(kept) == 1 else torch.cat(kept)
+
+
+def sample_poses(cell: Cell, count: int, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> Tensor:
+    """``count`` poses (count, 3): x_mm, y_mm, theta_rad, uniform on M x [-pi, pi)."""
+    positions = sample_positions(cell, count, generator, dtype)
+    theta = torch.rand(count, 1, generator=generator, dtype=dtype, device=generator.device) * (2 * math.pi) - math.pi
+    return torch.cat([positions, theta], -1)
+
+
+def sample_problems(cell: Cell, count: int, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    """``count`` starts and goals, each (count, 3)."""
+    poses = sample_poses(cell, 2 * count, generator, dtype)
+    return poses[:count], poses[count:]

@@ -1,0 +1,241 @@
+"""The rule book: what a command does to the object, what it earns, when an episode ends. Batched and pure.
+
+Every environment of the package is a thin skin over :class:`Rules`. All arrays may be numpy or torch; shapes are (...) for a
+batch of problems, (..., 3) for poses (x_mm, y_mm, theta_rad). Arms are indices; ``previous_arm`` is -1 before the first transfer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import IntEnum
+from typing import NamedTuple
+
+from marl_handover.arrays import Array, namespace, one_where, select, wrap
+from marl_handover.cell.cell import REACH_TOLERANCE_MM, Cell
+from marl_handover.config import TaskConfig
+
+MotionCost = Callable[[Cell, Array, Array, Array], Array]
+"""Cost in mm, shape (...), of a transfer: cell, arm (...), from_mm (..., 2), to_mm (..., 2). Eq. (3) of the paper."""
+
+
+class Outcome(IntEnum):
+    """How an episode ended; NONE while it goes on."""
+
+    NONE = 0
+    SUCCESS = 1
+    WRONG_ORIENTATION = 2
+    WRONG_POSITION = 3
+    TIMEOUT = 4
+
+
+class Command(NamedTuple):
+    """A decoded action: ``final`` bool (...), ``arm`` int (...), ``place_mm`` (..., 2)."""
+
+    final: Array
+    arm: Array
+    place_mm: Array
+
+
+class Verdict(NamedTuple):
+    """What a transfer earned: reward (...), terminated bool (...), outcome int (...)."""
+
+    reward: Array
+    terminated: Array
+    outcome: Array
+
+
+class Transition(NamedTuple):
+    """Result of one decision.
+
+    ``placed`` is the pose after the commanded transfer; ``pose`` also includes the external final transfer of architecture A,
+    done by ``external_arm`` (-1 where there was none). ``transfers`` counts both. ``feasible`` is False where the arm refused.
+    """
+
+    pose: Array
+    previous_arm: Array
+    placed: Array
+    command: Command
+    feasible: Array
+    external_arm: Array
+    transfers: Array
+    reward: Array
+    terminated: Array
+    outcome: Array
+
+
+def straight_line_mm(cell: Cell, arm: Array, start_mm: Array, end_mm: Array) -> Array:
+    """Length of the straight line from pick-up to drop-off: the simplest :data:`MotionCost`."""
+    xp = namespace(start_mm)
+    return xp.sqrt(((end_mm - start_mm) ** 2).sum(-1))
+
+
+class Rules:
+    """The decision problem of one cell (method section 3)."""
+
+    def __init__(self, cell: Cell, config: TaskConfig, motion_cost: MotionCost = straight_line_mm) -> None:
+        config.validate()
+        self.cell = cell
+        self.config = config
+        self.motion_cost = motion_cost
+        self.epsilon_rad = math.radians(config.epsilon_deg)
+        self.noisy = config.noise.position_mm > 0 or config.noise.yaw_deg > 0
+
+    @property
+    def external_finish(self) -> bool:
+        """Architecture A: the final transfer is found by kinematics, not by the policy."""
+        return self.config.architecture == "A"
+
+    def orientation_error(self, theta_rad: Array, goal_theta_rad: Array) -> Array:
+        """Signed error in rad, wrapped modulo the block's symmetry 2 pi / k; elementwise."""
+        k = self.config.symmetry_order
+        return wrap((theta_rad - goal_theta_rad) * k) / k
+
+    def finishing_error(self, pose: Array, goal: Array) -> Array:
+        """Orientation error each arm would leave if it took the object to the goal now: rad, (..., num_arms). Ignores reach."""
+        yaw, goal_yaw = self.cell.polar(pose)[1], self.cell.polar(goal)[1]
+        return self.orientation_error(pose[..., 2:3] + goal_yaw - yaw, goal[..., 2:3])
+
+    def can_finish(self, pose: Array, goal: Array, epsilon_rad: Array | float | None = None) -> Array:
+        """Which arms can put the object at the goal within epsilon: bool (..., num_arms)."""
+        epsilon = self._epsilon(epsilon_rad)
+        reach = self.cell.reaches(pose) & self.cell.reaches(goal)
+        return reach & (abs(self.finishing_error(pose, goal)) <= epsilon)
+
+    def decode(self, action: Array) -> Command:
+        """Command of an action (..., 4): final, arm, alpha, beta, each in [-1, 1]; a positive first or second number means final / R."""
+        xp = namespace(action)
+        arm = xp.where(action[..., 1] > 0, 1, 0)
+        final = action[..., 0] > 0
+        if self.external_finish:
+            final = xp.zeros_like(final)
+        alpha, beta = xp.clip(action[..., 2], -1.0, 1.0), xp.clip(action[..., 3], -1.0, 1.0)
+        return Command(final, arm, self.cell.chart.to_table(alpha, beta))
+
+    def transfer(self, pose: Array, goal: Array, command: Command) -> tuple[Array, Array]:
+        """Where a command takes the object on exact hardware, and whether the arm can do it: ((..., 3), bool (...)).
+
+        theta' = theta + psi_b(p') - psi_b(p). A refused transfer leaves the object where it is.
+        """
+        xp = namespace(pose)
+        square, yaw = self.cell.polar(pose)
+        target = one_where(command.final, goal[..., :2], command.place_mm)
+        target_square, target_yaw = self.cell.polar(target)
+        feasible = self.cell.within(select(square, command.arm), select(yaw, command.arm)) & self.cell.within(
+            select(target_square, command.arm), select(target_yaw, command.arm)
+        )
+        turn = select(target_yaw - yaw, command.arm)
+        moved = xp.concat([target, wrap(pose[..., 2] + turn)[..., None]], -1)
+        return one_where(feasible, moved, pose), feasible
+
+    def judge(self, placed: Array, goal: Array, final: Array, feasible: Array, epsilon_rad: Array | float | None = None) -> Verdict:
+        """Reward r_A or r_B of a transfer that left the object at ``placed``; a pure function, also used for hindsight.
+
+        Architecture A: 0 and the end if an arm could now finish within epsilon, else -1. Architecture B: +20 and the end at the
+        goal within epsilon; -30 and the end for a refused transfer or a final one that missed; else -1.
+        """
+        xp = namespace(placed)
+        reward, one = self.config.reward, xp.ones_like(placed[..., 0])
+        if self.external_finish:
+            solved = self.can_finish(placed, goal, epsilon_rad).any(-1)
+            return Verdict(xp.where(solved, 0 * one, -one), solved, xp.where(solved, int(Outcome.SUCCESS), int(Outcome.NONE)))
+        distance = xp.sqrt(((placed[..., :2] - goal[..., :2]) ** 2).sum(-1))
+        there = distance <= xp.where(final, self.tolerance_mm * one, REACH_TOLERANCE_MM * one)
+        turned = abs(self.orientation_error(placed[..., 2], goal[..., 2])) <= self._epsilon(epsilon_rad, per_arm=False)
+        success = feasible & there & turned
+        failure = ~feasible | (final & ~success)
+        earned = xp.where(success, reward.success * one, xp.where(failure, reward.failure * one, reward.step * one))
+        missed = xp.where(feasible & there, int(Outcome.WRONG_ORIENTATION), int(Outcome.WRONG_POSITION))
+        outcome = xp.where(success, int(Outcome.SUCCESS), xp.where(failure, missed, int(Outcome.NONE)))
+        return Verdict(earned, success | failure, outcome)
+
+    @property
+    def tolerance_mm(self) -> float:
+        """How far from the goal position a final placement may land: 1 um on exact hardware, else the setting."""
+        return self.config.position_tolerance_mm if self.noisy else REACH_TOLERANCE_MM
+
+    def step(
+        self,
+        pose: Array,
+        goal: Array,
+        previous_arm: Array,
+        action: Array,
+        *,
+        transfers_left: Array | None = None,
+        epsilon_rad: Array | float | None = None,
+        noise: Array | None = None,
+    ) -> Transition:
+        """Apply one decision to a batch.
+
+        Args:
+            pose: (..., 3).
+            goal: (..., 3).
+            previous_arm: int (...), -1 for none.
+            action: (..., 4) as in :meth:`decode`.
+            transfers_left: int (...), transfers allowed from here; architecture A finishes externally only within it.
+            epsilon_rad: scalar or (...); the setting's value if None.
+            noise: (..., 3) offset of what is placed: mm, mm, rad.
+        """
+        xp = namespace(pose)
+        command = self.decode(action)
+        placed, feasible = self.transfer(pose, goal, command)
+        if noise is not None:
+            placed = self._displaced(placed, one_where(feasible, noise, 0 * noise))
+        if not self.external_finish:
+            verdict = self.judge(placed, goal, command.final, feasible, epsilon_rad)
+            none, one = 0 * command.arm - 1, 0 * command.arm + 1
+            after = xp.where(feasible, command.arm, previous_arm)
+            reward = self._less_motion(verdict.reward, command.arm, pose, placed)
+            return Transition(placed, after, placed, command, feasible, none, one, reward, verdict.terminated, verdict.outcome)
+        return self._step_external(pose, goal, previous_arm, command, placed, feasible, transfers_left, epsilon_rad, noise)
+
+    def _step_external(
+        self,
+        pose: Array,
+        goal: Array,
+        previous_arm: Array,
+        command: Command,
+        placed: Array,
+        feasible: Array,
+        transfers_left: Array | None,
+        epsilon_rad: Array | float | None,
+        noise: Array | None,
+    ) -> Transition:
+        """Architecture A: an object that can be finished is finished; before the command, if it can be already then."""
+        xp = namespace(pose)
+        early = self.can_finish(pose, goal, epsilon_rad).any(-1)  # solved at the start: the action is ignored
+        placed = one_where(early, pose, placed)
+        feasible = feasible | early
+        able = self.can_finish(placed, goal, epsilon_rad)
+        room = True if transfers_left is None else (early | (transfers_left > 1))
+        verdict = self.judge(placed, goal, command.final, feasible, epsilon_rad)
+        solved = verdict.terminated & room
+        external_arm = xp.where(solved, xp.argmax(able + 0.0, -1), -1)
+        finish = Command(solved, xp.where(solved, external_arm, command.arm), placed[..., :2])
+        final_pose, _ = self.transfer(placed, goal, finish)
+        if noise is not None:
+            final_pose = self._displaced(final_pose, one_where(solved, noise, 0 * noise))
+        after = xp.where(solved, external_arm, xp.where(feasible & ~early, command.arm, previous_arm))
+        transfers = xp.where(early, 0, 1) + xp.where(solved, 1, 0)
+        outcome = xp.where(solved, verdict.outcome, int(Outcome.NONE))
+        reward = self._less_motion(xp.where(solved, verdict.reward, -xp.ones_like(verdict.reward)), command.arm, pose, placed)
+        pose = one_where(solved, final_pose, placed)
+        return Transition(pose, after, placed, command, feasible, external_arm, transfers, reward, solved, outcome)
+
+    def _epsilon(self, epsilon_rad: Array | float | None, per_arm: bool = True) -> Array:
+        if epsilon_rad is None:
+            return self.epsilon_rad
+        if per_arm and not isinstance(epsilon_rad, float) and epsilon_rad.ndim:
+            return epsilon_rad[..., None]
+        return epsilon_rad
+
+    def _displaced(self, pose: Array, offset: Array) -> Array:
+        xp = namespace(pose)
+        moved = pose + offset
+        return xp.concat([moved[..., :2], wrap(moved[..., 2:])], -1)
+
+    def _less_motion(self, reward: Array, arm: Array, pose: Array, placed: Array) -> Array:
+        weight = self.config.reward.motion_weight
+        if weight == 0:
+            return reward
+        return reward - weight * self.motion_cost(self.cell, arm, pose[..., :2], placed[..., :2]) / 100

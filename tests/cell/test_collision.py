@@ -1,0 +1,152 @@
+"""Clearances against brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from marl_handover.cell.collision import enclosing_capsule, ground_clearance_mm, segment_distance, self_clearance_mm
+from marl_handover.cell.kinematics import ArmModel, transform
+from marl_handover.cell.urdf import Primitive, read_urdf
+from marl_handover.resources import resource_path
+
+ARM = ArmModel(read_urdf(resource_path("urdf/al5a.urdf")))
+LINKS = {link.name: link for link in ARM.description.links}
+BODIES = [["base_link"], ["turret"], ["upper_arm"], ["forearm"], ["wrist"], ["hand", "finger_left_link", "finger_right_link"]]
+Floats = NDArray[np.float64]
+
+SHAPES = [
+    Primitive("box", (40.0, 22.0, 16.0), (5.0, -3.0, 2.0), (0.3, -0.5, 1.0)),
+    Primitive("box", (10.0, 30.0, 30.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    Primitive("cylinder", (30.0, 24.0), (1.0, 2.0, 3.0), (0.4, 0.0, 0.2)),
+    Primitive("cylinder", (5.0, 80.0), (0.0, 0.0, 9.0), (0.0, 1.2, 0.0)),
+    Primitive("sphere", (12.0,), (3.0, 4.0, 5.0), (0.0, 0.0, 0.0)),
+]
+
+
+def surface(shape: Primitive, n: int = 4000) -> Floats:
+    """Points (m, 3) on a shape's surface, in its link's frame, with the extreme ones (corners, rims) among them."""
+    rng = np.random.default_rng(0)
+    if shape.kind == "box":
+        local = rng.uniform(-0.5, 0.5, (n, 3))
+        local[np.arange(n), rng.integers(0, 3, n)] = rng.choice([-0.5, 0.5], n)
+        corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3)
+        local = np.concatenate([local, corners]) * shape.size_mm
+    elif shape.kind == "cylinder":
+        around = np.linspace(0, 2 * np.pi, n)
+        ends = rng.choice([-0.5, 0.5], n) * shape.size_mm[1]
+        local = np.stack([shape.size_mm[0] * np.cos(around), shape.size_mm[0] * np.sin(around), ends], axis=-1)
+    else:
+        local = rng.normal(size=(10 * n, 3))
+        local *= shape.size_mm[0] / np.linalg.norm(local, axis=-1, keepdims=True)
+    T = transform(shape.xyz_mm, shape.rpy_rad)
+    return np.asarray(local @ T[:3, :3].T + T[:3, 3])
+
+
+def dense_distance(a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> float:
+    """Smallest distance among points sampled along two segments, zoomed in twice."""
+    s_range, t_range, best = (0.0, 1.0), (0.0, 1.0), np.inf
+    for _ in range(5):
+        s, t = np.linspace(*s_range, 81), np.linspace(*t_range, 81)
+        between = (a0 + s[:, None] * (a1 - a0))[:, None] - (b0 + t[:, None] * (b1 - b0))[None]
+        distance = np.linalg.norm(between, axis=-1)
+        i, j = np.unravel_index(distance.argmin(), distance.shape)
+        best = min(best, float(distance[i, j]))
+        ds, dt = 8 * (s[1] - s[0]), 8 * (t[1] - t[0])
+        s_range = (max(0.0, s[i] - ds), min(1.0, s[i] + ds))
+        t_range = (max(0.0, t[j] - dt), min(1.0, t[j] + dt))
+    return best
+
+
+# A coarse lattice makes parallel, crossing, touching and point-like segments common.
+coordinate = st.integers(-3, 3).map(float)
+point = st.tuples(coordinate, coordinate, coordinate).map(np.array)
+
+
+@given(a0=point, a1=point, b0=point, b1=point)
+@settings(max_examples=200, deadline=None)
+def test_segment_distance_equals_dense_sampling(a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> None:
+    exact = float(segment_distance(a0, a1, b0, b1))
+    sampled = dense_distance(a0, a1, b0, b1)
+    assert exact <= sampled + 1e-9
+    assert exact == pytest.approx(sampled, abs=2e-3)
+    assert exact == pytest.approx(float(segment_distance(b1, b0, a0, a1)), abs=1e-9)
+
+
+def test_segment_distance_is_batched() -> None:
+    ends = np.random.default_rng(0).normal(size=(4, 7, 3, 3))
+    batch = segment_distance(*ends)
+    assert batch.shape == (7, 3)
+    assert batch[5, 2] == segment_distance(*ends[:, 5, 2])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_capsule_encloses_its_shape_closely(shape: Primitive) -> None:
+    capsule = enclosing_capsule("link", shape)
+    points = surface(shape)
+    start, end = (np.broadcast_to(np.array(v), points.shape) for v in (capsule.start_mm, capsule.end_mm))
+    distance = segment_distance(points, points, start, end)
+    assert distance.max() <= capsule.radius_mm + 1e-9
+    assert distance.max() >= capsule.radius_mm - 0.1
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_ground_clearance_of_a_shape_equals_its_lowest_sampled_point(shape: Primitive, monkeypatch: pytest.MonkeyPatch) -> None:
+    links = tuple(link if link.name != "hand" else type(link)("hand", (shape,)) for link in ARM.description.links)
+    bare = tuple(link if link.name in ("hand", "turret") else type(link)(link.name, ()) for link in links)
+    arm = ArmModel(type(ARM.description)(**{**vars(ARM.description), "links": bare}))
+    q = np.random.default_rng(3).uniform(arm.lower_rad, arm.upper_rad, (20, 5))
+    frames = arm.link_transforms(q)["hand"]
+    heights = surface(shape) @ frames[:, 2, :3].T + frames[:, 2, 3]
+    exact = ground_clearance_mm(arm, q)
+    assert (exact <= heights.min(axis=0) + 1e-9).all()
+    np.testing.assert_allclose(exact, heights.min(axis=0), atol=0.05)
+
+
+def test_ground_clearance_of_the_arm_is_its_lowest_moving_link() -> None:
+    q = np.random.default_rng(4).uniform(ARM.lower_rad, ARM.upper_rad, (3, 10, 5))
+    frames = ARM.link_transforms(q)
+    heights = [
+        np.min(surface(shape) @ frames[name][..., 2, :3, None] + frames[name][..., 2, 3, None, None], axis=(-2, -1))
+        for body in BODIES[2:]
+        for name in body
+        for shape in LINKS[name].collisions
+    ]
+    np.testing.assert_allclose(ground_clearance_mm(ARM, q), np.min(heights, axis=0), atol=1e-9)
+
+
+def test_self_clearance_is_the_closest_pair_of_bodies_that_are_no_neighbours() -> None:
+    """Against capsules listed by hand: each body against all but its neighbours."""
+    q = np.random.default_rng(5).uniform(ARM.lower_rad, ARM.upper_rad, (12, 5))
+    clearance = self_clearance_mm(ARM, q)
+    frames = ARM.link_transforms(q)
+    assert clearance.shape == (12,)
+    for k in range(12):
+        ends = []
+        for number, body in enumerate(BODIES):
+            for name in body:
+                for shape in LINKS[name].collisions:
+                    capsule = enclosing_capsule(name, shape)
+                    T = frames[name][k]
+                    start, end = (T[:3, :3] @ np.array(v) + T[:3, 3] for v in (capsule.start_mm, capsule.end_mm))
+                    ends.append((number, start, end, capsule.radius_mm))
+        pairs = [(a, b) for a in ends for b in ends if b[0] - a[0] > 1]
+        nearest = min(dense_distance(a[1], a[2], b[1], b[2]) - a[3] - b[3] for a, b in pairs)
+        assert clearance[k] == pytest.approx(nearest, abs=0.02)
+
+
+def test_known_poses() -> None:
+    stretched, folded = np.zeros(5), np.radians([0.0, 90.0, -167.0, -95.0, 0.0])
+    assert self_clearance_mm(ARM, stretched) > 0
+    assert self_clearance_mm(ARM, folded) < 0  # the hand is pressed into the turret
+    assert ground_clearance_mm(ARM, stretched) == pytest.approx(67 - 13)
+    assert ground_clearance_mm(ARM, np.radians([0.0, -14.0, -90.0, 0.0, 0.0])) < 0
+
+
+def test_yaw_leaves_the_ground_clearance_alone() -> None:
+    q = np.random.default_rng(6).uniform(ARM.lower_rad, ARM.upper_rad, (20, 5))
+    turned = q + [0.7, 0, 0, 0, 0]
+    np.testing.assert_allclose(ground_clearance_mm(ARM, q), ground_clearance_mm(ARM, turned), atol=1e-9)

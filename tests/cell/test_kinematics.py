@@ -1,0 +1,179 @@
+"""Laws of forward and inverse kinematics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from marl_handover.arrays import wrap
+from marl_handover.cell.kinematics import ArmModel, rotation, transform
+from marl_handover.cell.urdf import ARM_JOINTS, ArmDescription, read_urdf
+from marl_handover.errors import InvalidSetting, UnknownKey, UnsupportedKinematics
+from marl_handover.resources import resource_path
+
+SHIPPED = resource_path("urdf/al5a.urdf")
+DESCRIPTION = read_urdf(SHIPPED)
+WIDE = {name: [-179.0, 179.0] for name in ARM_JOINTS}
+
+
+def moved(description: ArmDescription, **shifts_mm: tuple[float, float, float]) -> ArmDescription:
+    """The arm with some joints' origins shifted."""
+    joints = tuple(
+        replace(joint, xyz_mm=tuple(a + b for a, b in zip(joint.xyz_mm, shifts_mm.get(joint.name, (0, 0, 0)), strict=True)))
+        for joint in description.joints
+    )
+    return replace(description, joints=joints)
+
+
+# Upward offsets in every link, as a real bracket has them.
+BENT = moved(DESCRIPTION, shoulder=(-3, 0, 9), elbow=(2, 0, 11), wrist_pitch=(0, 0, -7), wrist_roll=(0, 0, 5), grasp=(4, 0, 0))
+ARMS = [ArmModel(DESCRIPTION, WIDE), ArmModel(BENT, WIDE)]
+angle = st.floats(-3.1, 3.1)
+
+
+@pytest.mark.parametrize("arm", ARMS, ids=["shipped", "bent"])
+@settings(max_examples=150, deadline=None)
+@given(yaw=angle, shoulder=angle, elbow=angle, pitch=angle, roll=angle)
+def test_fk_of_ik_is_identity_on_both_branches(arm: ArmModel, yaw: float, shoulder: float, elbow: float, pitch: float, roll: float) -> None:
+    """Any pose whose grip is before the yaw axis comes back from both branches, and one of them is the joint vector it came from."""
+    q = np.array([yaw, shoulder, elbow, wrap(pitch - shoulder - elbow), roll])
+    T_base_grip = arm.fk(q)
+    forward = math.cos(yaw) * T_base_grip[0, 3] + math.sin(yaw) * T_base_grip[1, 3]
+    assume(forward > 1.0)  # nearer to the yaw axis, or behind it, the yaw is not the direction of the point
+    back = arm.ik(T_base_grip[:3, 3], pitch, roll)
+    assert back.shape == (2, 5)
+    assert np.isfinite(back).all()
+    np.testing.assert_allclose(arm.fk(back), np.broadcast_to(T_base_grip, (2, 4, 4)), atol=1e-5)
+    same = np.abs(wrap(back - q)).max(axis=-1)
+    assert same.min() < 1e-5  # acos near a stretched elbow costs half the digits
+
+
+def test_branch_0_is_elbow_up() -> None:
+    arm = ARMS[0]
+    q = arm.ik([200.0, 0.0, 45.0])
+    heights = [arm.link_transforms(branch)["forearm"][2, 3] for branch in q]
+    assert heights[0] > heights[1]
+    assert q[0, 2] < 0 < q[1, 2]
+
+
+@given(x=st.floats(-250, 250), y=st.floats(-250, 250))
+@settings(max_examples=100, deadline=None)
+def test_level_grip_points_away_from_the_base(x: float, y: float) -> None:
+    """With pitch = roll = 0 the gripper's yaw is the base yaw, atan2 of the point: the arm is under-actuated."""
+    assume(140 < math.hypot(x, y) < 300)
+    q = ARMS[0].ik([x, y, 45.0])[0]
+    T = ARMS[0].fk(q)
+    assert wrap(q[0] - math.atan2(y, x)) == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(T[:3, :3], rotation(np.asarray(math.atan2(y, x)), (0, 0, 1)), atol=1e-12)
+
+
+def test_sign_convention() -> None:
+    arm = ARMS[0]
+    np.testing.assert_allclose(arm.fk(np.zeros(5)), transform((315.0, 0.0, 67.0), (0, 0, 0)), atol=1e-9)
+    for joint in (1, 2, 3):
+        assert arm.fk(0.1 * np.eye(5)[joint])[2, 3] > 67
+    assert arm.fk(0.1 * np.eye(5)[0])[1, 3] > 0
+    assert arm.fk(0.1 * np.eye(5)[4])[2, 1] > 0  # the grip's left side rises
+
+
+def test_batches_equal_single_calls() -> None:
+    arm = ARMS[1]
+    q = np.random.default_rng(0).uniform(-2, 2, (3, 4, 5))
+    T = arm.fk(q)
+    assert T.shape == (3, 4, 4, 4)
+    np.testing.assert_array_equal(T[2, 1], arm.fk(q[2, 1]))
+    points, pitch = T[..., :3, 3], np.linspace(-1, 1, 4)
+    assert arm.ik(points, pitch).shape == (3, 4, 2, 5)
+    np.testing.assert_allclose(arm.ik(points, pitch)[2, 1], arm.ik(points[2, 1], pitch[1]), atol=1e-12, equal_nan=True)
+    assert arm.fk(np.zeros((0, 5))).shape == (0, 4, 4)
+
+
+def test_link_transforms_agree_with_fk_and_open_the_fingers() -> None:
+    arm = ARMS[1]
+    q = np.random.default_rng(1).uniform(-2, 2, (6, 5))
+    np.testing.assert_allclose(arm.link_transforms(q)["grip"], arm.fk(q), atol=1e-9)
+    for gripper_mm, apart_mm in ((0.0, 0.0), (5.0, 10.0), (None, 32.0)):
+        frames = arm.link_transforms(q, gripper_mm)
+        gap = frames["finger_left_link"][:, :3, 3] - frames["finger_right_link"][:, :3, 3]
+        np.testing.assert_allclose(np.linalg.norm(gap, axis=-1), apart_mm, atol=1e-9)
+
+
+def test_out_of_reach_is_nan_and_within_no_limit() -> None:
+    arm = ARMS[0]
+    q = arm.ik([[316.0, 0.0, 67.0], [314.9, 0.0, 67.0], [115.0, 0.0, 67.0]])
+    assert np.isnan(q[0]).all()
+    assert np.isfinite(q[1]).all()
+    assert np.isnan(q[2]).all()  # the wrist would lie on the shoulder, but the links differ by 12 mm
+    assert not arm.within_limits(q[0]).any()
+
+
+def test_stretched_arm_is_reachable() -> None:
+    arm = ARMS[0]
+    np.testing.assert_allclose(arm.ik([315.0, 0.0, 67.0]), np.zeros((2, 5)), atol=1e-6)
+
+
+def test_limits_have_a_tiny_tolerance() -> None:
+    arm = ArmModel(DESCRIPTION, {"elbow": [-100, -10]})
+    inside = np.radians([0.0, 10.0, -10.0, 0.0, 0.0])
+    assert arm.within_limits(inside)
+    assert arm.within_limits(inside + [0, 0, 5e-10, 0, 0])
+    assert not arm.within_limits(inside + [0, 0, 1e-8, 0, 0])
+    assert not arm.within_limits(inside - [0, 0, math.radians(90) + 1e-8, 0, 0])
+    assert not arm.within_limits(inside + [math.radians(96), 0, 0, 0, 0])  # the other joints keep the URDF's limits
+    assert arm.within_limits(np.stack([inside, inside + 1])).tolist() == [True, False]
+
+
+def test_solutions_beyond_half_a_turn_are_found_within_limits() -> None:
+    q = np.radians([0.0, 150.0, -150.0, 0.0, 0.0])
+    point = ARMS[0].fk(q)[:3, 3]
+    arm = ArmModel(DESCRIPTION, {**WIDE, "shoulder": [-220.0, -200.0]})
+    assert math.degrees(arm.ik(point)[0, 1]) == pytest.approx(-210.0)
+
+
+@pytest.mark.parametrize("limits", [[10, -10], [1.0], [0, math.inf], [math.nan, 1]])
+def test_bad_limits_are_named(limits: list[float]) -> None:
+    with pytest.raises(InvalidSetting, match=r"joint_limits_deg\.elbow"):
+        ArmModel(DESCRIPTION, {"elbow": limits})
+
+
+def test_unknown_joint_is_named() -> None:
+    with pytest.raises(UnknownKey, match="knee.*elbow"):
+        ArmModel(DESCRIPTION, {"knee": [0, 1]})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('<axis xyz="0 -1 0"/>', '<axis xyz="0 1 0"/>', "joint 'shoulder' has axis (0.0, 1.0, 0.0)"),
+        ('<axis xyz="0 0 1"/>', '<axis xyz="1 0 0"/>', "joint 'base_yaw' has axis"),
+        ('xyz="0.094 0 0" rpy="0 0 0"', 'xyz="0.094 0 0" rpy="0 0 0.1"', "joint 'elbow' turns its frame"),
+        ('xyz="0.094 0 0"', 'xyz="0.094 0.003 0"', "joint 'elbow' is 3 mm off the arm's plane"),
+        ('xyz="0 0 0.024" rpy="0 0 0"', 'xyz="0.002 0 0.024" rpy="0 0 0"', "joint 'base_yaw' is 2 mm off"),
+        ('xyz="0.064 0 0"', 'xyz="0.064 0 0.004"', "off the axis of joint 'wrist_roll'"),
+        ('xyz="0.106 0 0"', 'xyz="0 0 0"', "has no length"),
+        ('<joint name="wrist_pitch" type="revolute">', '<joint name="wrist_pitch" type="prismatic">', "'wrist_pitch' is prismatic"),
+    ],
+)
+def test_another_kinematic_class_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = SHIPPED.read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / "other.urdf"
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(UnsupportedKinematics) as caught:
+        ArmModel(read_urdf(path))
+    assert message in str(caught.value)
+
+
+def test_rotation_follows_urdf_rpy() -> None:
+    """Fixed-axis roll, pitch, yaw, as the URDF standard has it, against the rotation matrices written out."""
+    r, p, y = 0.3, -0.7, 1.1
+    roll = [[1, 0, 0], [0, math.cos(r), -math.sin(r)], [0, math.sin(r), math.cos(r)]]
+    pitch = [[math.cos(p), 0, math.sin(p)], [0, 1, 0], [-math.sin(p), 0, math.cos(p)]]
+    yaw = [[math.cos(y), -math.sin(y), 0], [math.sin(y), math.cos(y), 0], [0, 0, 1]]
+    np.testing.assert_allclose(transform((1, 2, 3), (r, p, y))[:3, :3], np.array(yaw) @ pitch @ roll, atol=1e-12)

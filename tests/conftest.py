@@ -1,0 +1,69 @@
+"""Cells and random problems that many tests share; hypothesis draws the same examples at every run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import settings
+
+from marl_handover.cell import Cell, load_cell
+from marl_handover.config import RewardConfig, TaskConfig
+from marl_handover.task.problems import sample_problems
+from marl_handover.task.rules import Rules
+
+settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
+settings.load_profile("repeatable")
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def paper() -> Cell:
+    return load_cell("paper")
+
+
+@pytest.fixture(scope="session", params=["paper", "al5a"])
+def cell(request) -> Cell:
+    return load_cell(request.param)
+
+
+@pytest.fixture(scope="session")
+def rules_of():
+    """Rules of a cell and an architecture; keywords go to the task, ``motion_cost`` to the rules."""
+
+    def make(cell, architecture="B", motion_weight=0.0, motion_cost=None, **task):
+        config = TaskConfig(architecture=architecture, reward=RewardConfig(motion_weight=motion_weight), **task)
+        return Rules(cell, config, motion_cost) if motion_cost else Rules(cell, config)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def draw():
+    """``draw(cell, count, seed)``: float64 numpy starts, goals, previous arms and actions.
+
+    Half of the starts and half of the goals are moved into the shared space, where most decisions are taken.
+    """
+
+    def make(cell, count, seed):
+        random = np.random.default_rng(seed)
+        start, goal = (array.numpy() for array in sample_problems(cell, count, torch.Generator().manual_seed(seed)))
+        for poses in (start, goal):
+            shared = random.random(count) < 0.5
+            inside = cell.chart.to_table(*random.uniform(-1, 1, (2, count)))
+            poses[shared, :2] = inside[shared]
+        action = random.uniform(-1, 1, (count, 4))
+        return start, goal, random.integers(-1, 2, count), action
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def assert_same_angle():
+    """Angles are equal modulo a full turn."""
+
+    def check(actual, desired, atol=1e-9):
+        difference = np.asarray(actual) - np.asarray(desired)
+        np.testing.assert_allclose(np.remainder(difference + np.pi, 2 * np.pi) - np.pi, 0, atol=atol)
+
+    return check

@@ -1,0 +1,224 @@
+"""The Gymnasium goal environment: the API's own checks, rewards that a hindsight buffer can recompute, named errors."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from tensordict import TensorDict
+
+import marl_handover
+from marl_handover.config import NoiseConfig, RewardConfig, TaskConfig
+from marl_handover.envs import SupervisorEnv, SupervisorGoalEnv
+from marl_handover.errors import NotFinite, OutOfReach
+from marl_handover.task.rules import Outcome
+
+architectures = pytest.mark.parametrize("architecture", ["A", "B"])
+EASY = {"state": [0.0, 0.0, 0.0], "goal": [200.0, 180.0, math.pi / 2]}  # the left arm can finish at once
+
+
+def made(architecture="B", **keywords):
+    return gymnasium.make(f"marl_handover/Supervisor{architecture}-v0", **keywords)
+
+
+def walk(env, steps, seed=0):
+    """Random transitions (observation, action, next observation, reward, terminated, truncated, info), final every other time."""
+    random = np.random.default_rng(seed)
+    observation, _ = env.reset(seed=seed)
+    for _ in range(steps):
+        action = random.uniform(-1, 1, 4).astype(np.float32)
+        after, *rest = env.step(action)
+        yield (observation, action, after, *rest)
+        observation = env.reset()[0] if rest[1] or rest[2] else after
+
+
+@architectures
+def test_the_api_checker_has_nothing_to_say(architecture):
+    """Through ``gymnasium.make``, as a user gets it; the one notice let through says just that: it was given wrapped."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(made(architecture))
+        wrapped = [str(warning.message) for warning in caught]
+        caught.clear()
+        check_env(made(architecture).unwrapped)
+    assert [text for text in wrapped if "different from the unwrapped version" not in text] == []
+    assert [str(warning.message) for warning in caught] == []
+
+
+def test_importing_the_package_registers_both():
+    assert marl_handover.__version__
+    for architecture in ("A", "B"):
+        env = made(architecture).unwrapped
+        assert isinstance(env, SupervisorGoalEnv)
+        assert env.rules.config.architecture == architecture
+        assert env.action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
+        assert set(env.observation_space) == {"observation", "achieved_goal", "desired_goal"}
+
+
+@architectures
+@pytest.mark.parametrize("layout", ["raw", "relative", "object"])
+def test_observations_are_in_their_space(architecture, layout):
+    env = SupervisorGoalEnv(architecture, task=TaskConfig(layout=layout, noise=NoiseConfig(5.0, 3.0)))
+    for before, _, after, *_ in walk(env, 300):
+        assert env.observation_space.contains(before)
+        assert env.observation_space.contains(after)
+
+
+def test_the_observation_has_no_goal():
+    """A hindsight buffer swaps only ``desired_goal``."""
+    env = made("B")
+    seen = [env.reset(options={"state": EASY["state"], "goal": goal})[0] for goal in (EASY["goal"], [-200, -180, 1])]
+    np.testing.assert_array_equal(seen[0]["observation"], seen[1]["observation"])
+    assert not np.array_equal(seen[0]["desired_goal"], seen[1]["desired_goal"])
+
+
+@pytest.mark.parametrize("noise", [NoiseConfig(), NoiseConfig(2.0, 2.0)])
+def test_the_reward_of_a_step_can_be_recomputed(noise):
+    env = SupervisorGoalEnv("B", task=TaskConfig(layout="object", epsilon_deg=40.0, noise=noise))
+    rewards = []
+    for _, _, after, reward, terminated, _, info in walk(env, 3000):
+        assert env.compute_reward(after["achieved_goal"], after["desired_goal"], info) == reward
+        assert env.compute_terminated(after["achieved_goal"], after["desired_goal"], info) == terminated
+        rewards.append(reward)
+    assert set(rewards) == {20, -1, -30}
+
+
+def test_relabelled_placements_succeed():
+    env = made("B").unwrapped
+    count = 0
+    for _, _, after, _, _, _, info in walk(env, 1000):
+        if info["feasible"]:
+            assert env.compute_reward(after["achieved_goal"], after["achieved_goal"], {**info, "final": True}) == 20
+            count += 1
+    assert count > 100
+
+
+@architectures
+def test_vectorised_rewards_equal_a_loop(architecture):
+    env = made(architecture).unwrapped
+    rows = [(after["achieved_goal"], after["desired_goal"], info) for _, _, after, _, _, _, info in walk(env, 500)]
+    achieved, desired = (np.stack([row[i] for row in rows]) for i in (0, 1))
+    desired[::2] = achieved[::2]
+    infos = [row[2] for row in rows]
+    rewards = env.compute_reward(achieved, desired, infos)
+    ends = env.compute_terminated(achieved, desired, infos)
+    assert rewards.shape == ends.shape == (500,)
+    assert len(set(rewards)) > 1
+    loop = [env.compute_reward(*row) for row in zip(achieved, desired, infos, strict=True)]
+    assert all(isinstance(value, float) for value in loop)
+    np.testing.assert_array_equal(rewards, loop)
+    np.testing.assert_array_equal(ends, [env.compute_terminated(*row) for row in zip(achieved, desired, infos, strict=True)])
+    one_info = env.compute_reward(achieved, desired, infos[0])
+    np.testing.assert_array_equal(one_info, env.compute_reward(achieved, desired, [infos[0]] * 500))
+    np.testing.assert_array_equal(env.compute_reward(achieved, desired, {}), env.compute_reward(achieved, desired, [{}] * 500))
+
+
+def test_options_set_the_problem():
+    env = made("B")
+    observation, info = env.reset(seed=0, options={"state": [10.0, 20.0, 2 * math.pi + 0.25], "goal": [200.0, 180.0, -0.5]})
+    np.testing.assert_allclose(observation["achieved_goal"], [10, 20, 0.25], atol=1e-5)
+    np.testing.assert_allclose(observation["desired_goal"], [200, 180, -0.5], atol=1e-5)
+    assert (info["transfers"], info["outcome"], info["is_success"]) == (0, "none", False)
+    only_goal, _ = env.reset(seed=7, options={"goal": [200.0, 180.0, -0.5]})
+    np.testing.assert_array_equal(only_goal["achieved_goal"], env.reset(seed=7)[0]["achieved_goal"])
+    env.reset(options=EASY)
+    _, reward, terminated, truncated, info = env.step(np.array([1, -1, 0, 0], np.float32))
+    assert (reward, terminated, truncated, info["outcome"], info["is_success"]) == (20, True, False, "success", True)
+
+
+@pytest.mark.parametrize("what", ["state", "goal"])
+@pytest.mark.parametrize("position", [(0.0, 500.0), (0.0, 180.0), (230.0, 0.0)])
+def test_poses_out_of_reach_are_named(what, position):
+    with pytest.raises(OutOfReach, match=rf"{what} \({position[0]:g}, {position[1]:g}\) mm.*150 to 230"):
+        made().reset(options={what: [*position, 0.0]})
+
+
+@pytest.mark.parametrize("what", ["state", "goal"])
+@pytest.mark.parametrize("pose", [(math.nan, 0, 0), (0, 0, math.nan), (0, math.inf, 0)])
+def test_poses_that_are_not_finite_are_named(what, pose):
+    with pytest.raises(NotFinite, match=what):
+        made().reset(options={what: pose})
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("index", range(4))
+def test_actions_that_are_not_finite_are_named_and_change_nothing(bad, index):
+    env = made().unwrapped
+    env.reset(seed=0, options=EASY)
+    action = np.array([1, -1, 0, 0], np.float32)
+    action[index] = bad
+    with pytest.raises(NotFinite, match="action"):
+        env.step(action)
+    assert env.step(np.array([1, -1, 0, 0], np.float32))[-1]["transfers"] == 1
+
+
+@architectures
+def test_the_seed_decides(architecture):
+    task = TaskConfig(layout="object", noise=NoiseConfig(1.0, 1.0))
+    first, again, other = (list(walk(SupervisorGoalEnv(architecture, task=task), 60, seed)) for seed in (5, 5, 6))
+    for one, same in zip(first, again, strict=True):
+        assert one[3:] == same[3:]
+        np.testing.assert_array_equal(one[2]["achieved_goal"], same[2]["achieved_goal"])
+    assert any((one[0]["desired_goal"] != two[0]["desired_goal"]).any() for one, two in zip(first, other, strict=True))
+    env = SupervisorGoalEnv(architecture, task=task)
+    starts = [env.reset(seed=5)[0]["achieved_goal"], env.reset()[0]["achieved_goal"], env.reset(seed=5)[0]["achieved_goal"]]
+    np.testing.assert_array_equal(starts[0], starts[2])
+    assert not np.array_equal(starts[0], starts[1])
+
+
+@architectures
+def test_reaching_the_limit_truncates(architecture):
+    env = made(architecture)
+    env.reset(options={"state": [0, 0, 0], "goal": [200, 180, -math.pi / 2]})
+    for count in range(1, 21):
+        _, reward, terminated, truncated, info = env.step(np.array([-1, -1, 0, 0], np.float32))
+        assert (reward, terminated, truncated, info["transfers"]) == (-1, False, count == 20, count)
+        assert info["outcome"] == ("timeout" if count == 20 else "none")
+
+
+@architectures
+def test_it_equals_the_batched_environment(architecture):
+    task = {"architecture": architecture, "layout": "object", "epsilon_deg": 30.0, "max_steps": 6}
+    env, batched = SupervisorGoalEnv(architecture, task=TaskConfig(**task)), SupervisorEnv(1, task=TaskConfig(**task), seed=0)
+    previous, transfers, outcomes = -1, 0, set()
+    template = batched.reset()
+    for before, action, after, reward, terminated, truncated, info in walk(env, 400):
+        state = TensorDict({**template}, [1])
+        state["achieved_goal"], state["desired_goal"] = (torch.tensor(before[key])[None] for key in ("achieved_goal", "desired_goal"))
+        state["previous_arm"], state["transfers"] = torch.tensor([[previous]]), torch.tensor([[transfers]])
+        state["action"] = torch.tensor(action)[None]
+        twin = batched.step(state)["next"]
+        apart = np.remainder(twin["achieved_goal"][0].numpy() - after["achieved_goal"] + math.pi, 2 * math.pi) - math.pi
+        assert np.abs(apart).max() < 2e-3
+        unlike = twin["observation"][0].numpy() - after["observation"]
+        unlike[2] = np.remainder(unlike[2] + 1, 2) - 1  # theta / pi
+        np.testing.assert_allclose(unlike, 0, atol=1e-4)
+        assert (twin["reward"].item(), twin["terminated"].item(), twin["truncated"].item()) == (reward, terminated, truncated)
+        assert (twin["feasible"].item(), twin["transfers"].item()) == (info["feasible"], info["transfers"])
+        assert Outcome(twin["outcome"].item()).name.lower() == info["outcome"]
+        outcomes.add(info["outcome"])
+        previous, transfers = (-1, 0) if terminated or truncated else (twin["previous_arm"].item(), info["transfers"])
+    assert {"none", "success"} <= outcomes
+
+
+def test_an_environment_leaves_the_settings_it_was_given_alone():
+    """Two environments made from one task, each with its own architecture."""
+    task = TaskConfig(layout="object")
+    first = SupervisorGoalEnv("B", task=task)
+    SupervisorGoalEnv("A", task=task)
+    assert first.rules.config.architecture == "B"
+    assert task.architecture == TaskConfig().architecture
+
+
+def test_the_motion_cost_is_recomputed_too():
+    """With the coupled reward a step's reward is still the one that ``compute_reward`` gives from what a buffer stores."""
+    env = SupervisorGoalEnv("B", task=TaskConfig(layout="object", reward=RewardConfig(motion_weight=1.0)))
+    env.reset(options={"state": [200.0, 180.0, 0.0], "goal": [-200.0, -180.0, 0.0]})
+    after, reward, *_, info = env.step(np.array([-1, -1, 0, 0], np.float32))
+    assert reward == pytest.approx(-1 - math.hypot(200, 180) / 100)
+    assert env.compute_reward(after["achieved_goal"], after["desired_goal"], info) == pytest.approx(reward)
