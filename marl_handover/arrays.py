@@ -1,7 +1,7 @@
 """One code path for numpy arrays and torch tensors.
 
-The rule book is written once against the functions that numpy 2 and torch spell alike (``sin``, ``atan2``, ``where``, ``stack``, ``concat`` ...).
-Importing this module does not import torch, so an exported policy runs without it.
+The rule book is written once against the functions that numpy 2 and torch spell alike (``sin``, ``atan2``, ``where``,
+``stack``, ``concat`` ...). Importing this module does not import torch, so an exported policy runs without it.
 """
 
 from __future__ import annotations

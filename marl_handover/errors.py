@@ -1,6 +1,7 @@
 """Named errors that carry the value, the limit and the valid choices.
 
-Every error a user can cause derives from :class:`HandoverError`; the command line prints its message as one line and exits with ``exit_status``.
+Every error a user can cause derives from :class:`HandoverError`; the command line prints its message as one line and exits
+with ``exit_status``.
 """
 
 from __future__ import annotations

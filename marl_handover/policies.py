@@ -1,8 +1,9 @@
 """Supervisor policies by name, as plain callables on numpy. Nothing here needs torch unless a run directory's checkpoint is read.
 
-A policy answers two calls: ``policy(observation)`` takes one observation of the AEC supervisor (``state``, ``goal``, ``previous_arm`` 0 none, 1 L, 2 R) and returns
-its action (``final``, ``arm``, ``place``); ``policy.act(pose, goal, previous_arm)`` takes batches (n, 3), (n, 3), (n,) (-1 none, 0 L, 1 R), or single
-problems (3,), (3,), (), and returns actions (n, 4) or (4,).
+A policy answers two calls: ``policy(observation)`` takes one observation of the AEC supervisor (``state``, ``goal``,
+``previous_arm`` 0 none, 1 L, 2 R) and returns its action (``final``, ``arm``, ``place``); ``policy.act(pose, goal,
+previous_arm)`` takes batches (n, 3), (n, 3), (n,) (-1 none, 0 L, 1 R), or single problems (3,), (3,), (), and returns
+actions (n, 4) or (4,).
 """
 
 from __future__ import annotations
@@ -90,7 +91,9 @@ class RandomPolicy(SupervisorPolicy):
 
 
 class GreedyPolicy(SupervisorPolicy):
-    """Nearest arm: finishes when an arm can; else the nearer arm hands over, at the place of a few that leaves the other the least error."""
+    """Nearest arm: finishes when an arm can; else the nearer arm hands over, at the place of a few that leaves the other the
+    least error.
+    """
 
     PLACES = 33
 
@@ -133,7 +136,7 @@ class NetworkPolicy(SupervisorPolicy):
         self.hybrid = about["kind"] == "hybrid"
         self.odd = np.array([-1.0 if field in ODD_FIELDS else 1.0 for field in ARM_FIELDS], np.float32)
         self.beta_sign = np.array([base.mirror for base in rules.cell.bases], np.float32)
-        self.sine = ARM_FIELDS.index("sin_hand_over")
+        self.sines = [ARM_FIELDS.index(field) for field in ("sin_hand_over", "sin_finish_error")]
         self.angles = [ARM_FIELDS.index(field) for field in ("cos_finish_error", "cos_hand_over")]
 
     def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
@@ -150,9 +153,7 @@ class NetworkPolicy(SupervisorPolicy):
     def _hybrid(self, observation: NDArray[np.float32]) -> Floats:
         modes = self.about["modes"]
         blocks = observation.reshape(*observation.shape[:-1], -1, len(ARM_FIELDS))
-        sign = (
-            np.where(blocks[..., self.sine] < 0, np.float32(-1), np.float32(1)) if self.about["canonical"] else np.ones_like(blocks[..., 0])
-        )
+        sign = self._sign(blocks)
         turned = np.where(sign[..., None] < 0, blocks * self.odd, blocks)
         out = self._forward(self._harmonics(turned))
         logits = out[..., : 1 + modes]
@@ -166,6 +167,12 @@ class NetworkPolicy(SupervisorPolicy):
         place = np.take_along_axis(mean, np.asarray(index)[..., None, None], -2)[..., 0, :]
         final, right = np.where(choice == 0, 1.0, -1.0), 2.0 * arm - 1.0
         return np.stack([final, right, place[..., 0] * select(sign, arm), place[..., 1] * self.beta_sign[arm]], -1)
+
+    def _sign(self, blocks: NDArray[np.float32]) -> NDArray[np.float32]:
+        if not self.about["canonical"]:
+            return np.ones_like(blocks[..., 0])
+        hand_over, finish = (blocks[..., index] for index in self.sines)
+        return np.where(np.where(hand_over == 0, finish, hand_over) < 0, np.float32(-1), np.float32(1))
 
     def _harmonics(self, blocks: NDArray[np.float32]) -> NDArray[np.float32]:
         parts = [blocks]

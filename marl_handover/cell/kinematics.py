@@ -139,10 +139,8 @@ class ArmModel:
         if joint.kind == "prismatic":
             travel = joint.upper if gripper_mm is None else min(joint.lower + gripper_mm, joint.upper)
             return np.asarray(T @ transform([travel * component for component in joint.axis], (0.0, 0.0, 0.0)))
-        if joint.name not in ARM_JOINTS:  # a hinged finger: taken at its lower stop
-            angle = np.asarray(joint.lower)
-        else:
-            angle = q[..., ARM_JOINTS.index(joint.name)]
+        # A hinged finger is taken at its lower stop.
+        angle = q[..., ARM_JOINTS.index(joint.name)] if joint.name in ARM_JOINTS else np.asarray(joint.lower)
         R_joint = rotation(angle, joint.axis)
         out = np.broadcast_to(T, np.broadcast_shapes(T.shape, (*R_joint.shape[:-2], 4, 4))).copy()
         out[..., :3, :3] = T[..., :3, :3] @ R_joint

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -19,6 +20,7 @@ GROUPS = {"algorithm": ALGORITHMS}
 
 def run(config: TrainConfig) -> int:
     """Start a run, or continue one from its last checkpoint with the settings it was started with."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     if config.resume:
         trainer = resumed(Path(config.resume), config.progress)
     else:

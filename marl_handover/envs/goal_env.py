@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -37,12 +38,11 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         task: the task's settings; the defaults, with layout ``object``, if None.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # as the base class has it
 
     def __init__(self, architecture: str = "B", cell: Cell | None = None, task: TaskConfig | None = None, render_mode: None = None) -> None:
         cell = cell or load_cell()
-        task = task or TaskConfig(architecture=architecture, layout="object")
-        task.architecture = architecture
+        task = replace(task or TaskConfig(layout="object"), architecture=architecture)
         self.rules = Rules(cell, task)
         self.render_mode = render_mode
         reach = float(max(abs(base.x_mm) for base in cell.bases) + cell.r_max_mm + 1.0)
@@ -75,7 +75,7 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         self._pose = self._checked("state", options["state"]) if "state" in options else start
         self._goal = self._checked("goal", options["goal"]) if "goal" in options else goal
         self._previous, self._transfers = np.int64(-1), 0
-        return self._observation(), self._info(True, False, Outcome.NONE)
+        return self._observation(), self._info(True, False, Outcome.NONE, 0.0)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Execute one command; see :class:`marl_handover.task.rules.Rules`."""
@@ -85,12 +85,13 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         result = self.rules.step(
             self._pose, self._goal, self._previous, np.asarray(action, np.float64), transfers_left=left, noise=self._noise()
         )
+        penalty = self.rules.motion_penalty(result.command.arm, self._pose, result.placed)
         self._pose, self._previous = result.pose, result.previous_arm
         self._transfers += int(result.transfers)
         terminated = bool(result.terminated)
         truncated = not terminated and self._transfers >= self.rules.config.max_steps
         outcome = Outcome.TIMEOUT if truncated else Outcome(int(result.outcome))
-        info = self._info(bool(result.feasible), bool(result.command.final), outcome)
+        info = self._info(bool(result.feasible), bool(result.command.final), outcome, float(penalty))
         return self._observation(), float(result.reward), terminated, truncated, info
 
     def compute_reward(
@@ -99,15 +100,17 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         """Reward of having achieved one pose when another was desired; vectorised over leading dimensions.
 
         Args:
-            achieved_goal, desired_goal: (3,) or (n, 3).
-            info: one mapping or one a row, read for ``feasible`` (True if absent) and ``final`` (False if absent).
+            achieved_goal: (3,) or (n, 3).
+            desired_goal: (3,) or (n, 3).
+            info: one mapping or one a row, read for ``feasible`` (True if absent), ``final`` (False if absent) and
+            ``motion_penalty`` (0 if absent).
 
         Returns:
             A float, or (n,) rewards.
         """
         final, feasible = self._flags(info, np.shape(achieved_goal)[:-1])
         achieved, desired = np.asarray(achieved_goal, np.float64), np.asarray(desired_goal, np.float64)
-        reward = self.rules.judge(achieved, desired, final, feasible).reward
+        reward = self.rules.judge(achieved, desired, final, feasible).reward - self._read(info, "motion_penalty", 0.0, final.shape)
         return float(reward) if np.ndim(reward) == 0 else reward
 
     def compute_terminated(
@@ -119,13 +122,14 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         return self.rules.judge(achieved, desired, final, feasible).terminated
 
     @staticmethod
-    def _flags(info: Any, shape: tuple[int, ...]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def _read(info: Any, key: str, absent: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+        """One value of one info, or of one info a row, as an array of ``shape``."""
         rows = [info] if isinstance(info, Mapping) else list(info)
-        final = np.array([bool(row.get("final", False)) for row in rows])
-        feasible = np.array([bool(row.get("feasible", True)) for row in rows])
-        return np.broadcast_to(final.reshape(-1)[0] if final.size == 1 else final, shape).copy(), np.broadcast_to(
-            feasible.reshape(-1)[0] if feasible.size == 1 else feasible, shape
-        ).copy()
+        values = np.array([row.get(key, absent) for row in rows])
+        return np.broadcast_to(values.reshape(-1)[0] if values.size == 1 else values, shape).copy()
+
+    def _flags(self, info: Any, shape: tuple[int, ...]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        return self._read(info, "final", False, shape).astype(bool), self._read(info, "feasible", True, shape).astype(bool)
 
     def _draw(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Next random problem; drawn in blocks, since one batched draw costs as much as one single draw."""
@@ -157,8 +161,9 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
             "desired_goal": self._goal.astype(np.float32),
         }
 
-    def _info(self, feasible: bool, final: bool, outcome: Outcome) -> dict[str, Any]:
+    def _info(self, feasible: bool, final: bool, outcome: Outcome, motion_penalty: float) -> dict[str, Any]:
         return {
+            "motion_penalty": motion_penalty,
             "feasible": feasible,
             "final": final,
             "transfers": self._transfers,

@@ -21,8 +21,9 @@ class SupervisorEnv(EnvBase):
     """A batch of independent cells under one rule book.
 
     Besides ``observation`` (the named layout), the tensordict carries the problem itself, so that hindsight can relabel it:
-    ``achieved_goal`` and ``desired_goal`` (num_envs, 3) in mm, mm, rad, ``previous_arm`` (-1 none, 0 L, 1 R), ``epsilon`` in rad, ``transfers`` so
-    far; and under ``next``: ``placed`` (the pose after the commanded transfer), ``feasible``, ``outcome``.
+    ``achieved_goal`` and ``desired_goal`` (num_envs, 3) in mm, mm, rad, ``previous_arm`` (-1 none, 0 L, 1 R), ``epsilon`` in
+    rad, ``transfers`` so far; and under ``next``: ``placed`` (the pose after the commanded transfer), ``feasible``,
+    ``outcome``.
 
     Args:
         num_envs: number of cells.

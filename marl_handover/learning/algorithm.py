@@ -18,7 +18,8 @@ from marl_handover.task.rules import Rules
 class Algorithm(ABC):
     """A learner of the supervisor's policy.
 
-    ``kind`` names the form of its exported actor (see :mod:`marl_handover.learning.export`); ``on_policy`` tells the trainer how to feed it.
+    ``kind`` names the form of its exported actor (see :mod:`marl_handover.learning.export`); ``on_policy`` tells the trainer
+    how to feed it.
     """
 
     kind: ClassVar[str]
@@ -53,9 +54,9 @@ class Algorithm(ABC):
     def schedule(self, fraction: float) -> None:
         """Set what changes in the course of training; ``fraction`` of it is done. Here: the learning rate."""
         start = self.config.decay_from
-        left = 1.0 if fraction <= start else max(0.0, (1.0 - fraction) / (1.0 - start))
+        left = 1.0 if fraction <= start or start >= 1.0 else max(0.0, (1.0 - fraction) / (1.0 - start))
         for part in self.modules().values():
-            if isinstance(part, torch.optim.Optimizer) and not part.defaults.get("fixed_rate"):
+            if isinstance(part, torch.optim.Optimizer):
                 for group in part.param_groups:
                     group["lr"] = self.config.learning_rate * left
 

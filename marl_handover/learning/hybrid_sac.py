@@ -1,9 +1,9 @@
 """Hybrid SAC: soft actor-critic for a choice (arm, final, place mode) with a continuous place (alpha, beta) in some of its branches.
 
-The expectation over the branches is exact: V = sum_i p_i [Q_i - a_place log pi_i(place)] - a_branch sum_i p_i log p_i, where the final branches have no
-place. Two temperatures, one for each kind of choice. Besides the soft gradient, the actor's mean is drawn towards the best of a few random places
-wherever the critic finds that place better by a margin: gradients alone leave some states in a poor local optimum, and a deterministic policy then
-cycles there for ever.
+The expectation over the branches is exact: V = sum_i p_i [Q_i - a_place log pi_i(place)] - a_branch sum_i p_i log p_i, where
+the final branches have no place. Two temperatures, one for each kind of choice. Besides the soft gradient, the actor's mean
+is drawn towards the best of a few random places wherever the critic finds that place better by a margin: gradients alone
+leave some states in a poor local optimum, and a deterministic policy then cycles there for ever.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from marl_handover.learning.networks import AfterstateCritic, Branches, HybridAc
 from marl_handover.learning.settings import SacConfig, TrainConfig
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Command, Rules
-
 
 EDGE = 1.15
 """Random places are drawn from a chart this much too large and brought back to its edge."""

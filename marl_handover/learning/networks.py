@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -32,7 +33,7 @@ class TwinMLP(nn.Module):
         super().__init__()
         widths = [inputs, *hidden, 1]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        for fan_in, fan_out in zip(widths[:-1], widths[1:], strict=True):
+        for fan_in, fan_out in pairwise(widths):
             bound = 1 / math.sqrt(fan_in)
             self.weights.append(nn.Parameter(torch.empty(2, fan_in, fan_out).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(torch.empty(2, 1, fan_out).uniform_(-bound, bound)))
@@ -49,20 +50,24 @@ class TwinMLP(nn.Module):
 
 
 class Mirror(nn.Module):
-    """Folds the symmetry M_x: turns each arm's block so that the sine of its hand-over angle is never negative."""
+    """Folds the symmetry M_x: turns each arm's block so that the sine of its hand-over angle is never negative.
+
+    Where the hand-over has no bearing (that sine is 0), the sine of the finishing error decides.
+    """
 
     odd: Tensor
 
     def __init__(self, enabled: bool) -> None:
         super().__init__()
         self.enabled = enabled
-        self.index = ARM_FIELDS.index("sin_hand_over")
+        self.index = (ARM_FIELDS.index("sin_hand_over"), ARM_FIELDS.index("sin_finish_error"))
         odd = torch.tensor([-1.0 if name in ODD_FIELDS else 1.0 for name in ARM_FIELDS])
         self.register_buffer("odd", odd, persistent=False)
 
     def forward(self, blocks: Tensor) -> tuple[Tensor, Tensor]:
         """Blocks (..., m, fields) are turned by the sign, (..., 1), of their first block; both are returned."""
-        first = blocks[..., 0, self.index : self.index + 1]
+        hand_over, finish = (blocks[..., 0, index : index + 1] for index in self.index)
+        first = torch.where(hand_over == 0, finish, hand_over)
         sign = torch.where(first < 0, -1.0, 1.0) if self.enabled else torch.ones_like(first)
         return torch.where(sign[..., None] < 0, blocks * self.odd, blocks), sign
 
@@ -128,9 +133,10 @@ class HybridActor(nn.Module):
         self.modes, self.can_finish = modes, can_finish
         self.mirror, self.harmonics = Mirror(canonical), Harmonics(harmonics)
         self.net = mlp(self.harmonics.width, hidden, 1 + 5 * modes)
-        if modes > 1:  # start the modes apart, so that they do not learn the same thing
+        last = self.net[-1]
+        if modes > 1 and isinstance(last, nn.Linear):  # start the modes apart, so that they do not learn the same thing
             with torch.no_grad():
-                self.net[-1].bias[1 + modes : 1 + 3 * modes : 2] = torch.linspace(-0.8, 0.8, modes)
+                last.bias[1 + modes : 1 + 3 * modes : 2] = torch.linspace(-0.8, 0.8, modes)
         self.register_buffer("beta_sign", torch.tensor([float(base.mirror) for base in cell.bases]), persistent=False)
 
     def forward(self, observation: Tensor) -> Branches:
@@ -150,8 +156,8 @@ class HybridActor(nn.Module):
 class AfterstateCritic(nn.Module):
     """Twin values of the branches.
 
-    Where an arm puts the object is known from kinematics, so the value of placing it is read off the observation that *follows* (the acting arm's
-    block first), and the value of finishing off the acting arm's present block.
+    Where an arm puts the object is known from kinematics, so the value of placing it is read off the observation that
+    *follows* (the acting arm's block first), and the value of finishing off the acting arm's present block.
     """
 
     def __init__(self, hidden: Sequence[int], canonical: bool, harmonics: int) -> None:

@@ -1,8 +1,9 @@
 """Hindsight replay that is right for this problem.
 
-TorchRL's :class:`HERReplayBuffer` relabels goal and reward. Here the end flag, the final flag and the observations change with the goal too:
-a hand-over by arm b that left the object at s' is exactly what the *final* action of b would have done had the goal been s'. So this subclass
-stores what does not depend on the goal, and derives the rest from the rule book at sampling time, at the present epsilon.
+TorchRL's :class:`HERReplayBuffer` relabels goal and reward. Here the end flag, the final flag and the observations change
+with the goal too: a hand-over by arm b that left the object at s' is exactly what the *final* action of b would have done
+had the goal been s'. So this subclass stores what does not depend on the goal, and derives the rest from the rule book at
+sampling time, at the present epsilon.
 """
 
 from __future__ import annotations
@@ -72,8 +73,9 @@ class EpisodeWriter:
 class HindsightReplayBuffer(HERReplayBuffer):
     """Replay memory of whole episodes that answers :meth:`sample` with relabelled, re-judged transitions.
 
-    A sampled batch holds ``observation``, ``action``, ``achieved_goal``, ``desired_goal``, ``epsilon``, ``arm``, ``final`` and, under ``next``,
-    ``observation``, ``achieved_goal`` (the pose after the commanded transfer), ``reward``, ``terminated``, ``done``.
+    A sampled batch holds ``observation``, ``action``, ``achieved_goal``, ``desired_goal``, ``epsilon``, ``arm``, ``final``
+    and, under ``next``, ``observation``, ``achieved_goal`` (the pose after the commanded transfer), ``reward``,
+    ``terminated``, ``done``.
     """
 
     def __init__(self, rules: Rules, config: ReplayConfig, env: SupervisorEnv, generator: torch.Generator) -> None:
@@ -95,7 +97,9 @@ class HindsightReplayBuffer(HERReplayBuffer):
 
     def _judge(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         verdict = self.rules.judge(batch["placed"], batch["desired_goal"], batch["final"], batch["feasible"][:, 0], batch["epsilon"][:, 0])
-        return verdict.reward[:, None], verdict.terminated[:, None]
+        arm = self.rules.decode(batch["action"]).arm
+        reward = verdict.reward - self.rules.motion_penalty(arm, batch["achieved_goal"], batch["placed"])
+        return reward[:, None], verdict.terminated[:, None]
 
     def sample_transitions(self, count: int) -> TensorDict:
         """``count`` transitions drawn uniformly, relabelled, mirrored if the settings say so, and judged at the present epsilon."""
@@ -138,7 +142,9 @@ class HindsightReplayBuffer(HERReplayBuffer):
         batch["hindsight"] = chosen[:, None]
 
     def _near_miss(self, goal: Tensor, epsilon: Tensor) -> Tensor:
-        """Some goals turned a little. What was achieved then misses them, or just not: exact hindsight alone only ever shows an error of 0."""
+        """Some goals turned a little. What was achieved then misses them, or just not: exact hindsight alone only ever shows
+        an error of 0.
+        """
         count, settings = len(goal), self.config.hindsight
         turn = torch.rand(count, generator=self.draw, device=goal.device) * 2 - 1
         turn = turn * settings.near_miss_epsilons * epsilon * self._chance(count, settings.near_miss_ratio)

@@ -58,7 +58,9 @@ class Trace:
         }
 
     def _external(self, decision: Decision, row: int) -> dict[str, Any] | None:
-        """The external final transfer of architecture A; None where there was none. The reward stands with the command, if there was one."""
+        """The external final transfer of architecture A; None where there was none. The reward stands with the command, if
+        there was one.
+        """
         result = decision.result
         arm = int(result.external_arm[row])
         if arm < 0:

@@ -27,9 +27,11 @@ ARM_FIELDS = (
     "cos_finish_error",
     "sin_finish_error",
     "finish_error_in_epsilons",
+    "finish_margin",
     "cos_hand_over",
     "sin_hand_over",
     "other_finish_error_in_epsilons",
+    "other_finish_margin",
     "was_previous",
     "other_was_previous",
     "log_epsilon",
@@ -38,6 +40,7 @@ ARM_FIELDS = (
 
 ``finish_error`` is the orientation error this arm would leave if it placed the object at the goal now. ``hand_over`` is the hand-over angle
 psi_own(p) - psi_other(p) at which passing the object at p would let the other arm finish exactly. All are mirrored into the arm's frame.
+What an arm that does not reach the goal would leave has no bearing on the problem: its cosine, sine and error are 0, its margin -1.
 """
 
 ODD_FIELDS = ("x", "goal_x", "sin_finish_error", "finish_error_in_epsilons", "sin_hand_over", "other_finish_error_in_epsilons")
@@ -45,6 +48,9 @@ ODD_FIELDS = ("x", "goal_x", "sin_finish_error", "finish_error_in_epsilons", "si
 
 ERROR_CLIP = 3.0
 """Errors in units of epsilon are cut off here."""
+
+MARGIN_SLOPE = 2.0
+"""The margin, 1 for no error, crosses 0 at an error of epsilon with this slope, and ends at -1."""
 
 
 def observation_size(layout: str) -> int:
@@ -95,7 +101,10 @@ def _relative(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsil
     other_goal_psi = xp.flip(cell.gripper_yaw(goal_yaw), (-1,))
     hand_over = (cell.gripper_yaw(yaw) - turn - other_goal_psi) * rules.config.symmetry_order
     epsilon = epsilon_rad + 0 * pose[..., 0]
-    in_epsilons = xp.clip(mirror * finish / epsilon[..., None], -ERROR_CLIP, ERROR_CLIP) / ERROR_CLIP
+    relative_error = mirror * finish / epsilon[..., None]
+    in_epsilons = goal_reach * xp.clip(relative_error, -ERROR_CLIP, ERROR_CLIP) / ERROR_CLIP
+    margin = goal_reach * (1 + xp.clip(MARGIN_SLOPE * (1 - abs(relative_error)), -1.0, 1.0)) - 1
+    other_goal_reach = xp.flip(goal_reach, (-1,))
     was_previous = xp.stack([(previous_arm == index) + 0 * pose[..., 0] for index in range(cell.num_arms)], -1)
     one = xp.ones_like(yaw)
     fields = [
@@ -106,13 +115,15 @@ def _relative(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsil
         reach,
         xp.flip(reach, (-1,)),
         goal_reach,
-        xp.flip(goal_reach, (-1,)),
-        xp.cos(finish * rules.config.symmetry_order),
-        mirror * xp.sin(finish * rules.config.symmetry_order),
+        other_goal_reach,
+        goal_reach * xp.cos(finish * rules.config.symmetry_order),
+        goal_reach * mirror * xp.sin(finish * rules.config.symmetry_order),
         in_epsilons,
-        xp.cos(hand_over),
-        mirror * xp.sin(hand_over),
+        margin,
+        other_goal_reach * xp.cos(hand_over),
+        other_goal_reach * mirror * xp.sin(hand_over),
         xp.flip(in_epsilons, (-1,)) * -1,
+        xp.flip(margin, (-1,)),
         was_previous,
         xp.flip(was_previous, (-1,)),
         xp.log(epsilon)[..., None] / 4 * one,

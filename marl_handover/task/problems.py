@@ -32,7 +32,7 @@ def sample_positions(cell: Cell, count: int, generator: torch.Generator, dtype: 
         points = points[owner == arm][:missing]
         kept.append(points)
         missing -= len(points)
-    return kept[0] if len(kept) == 1 else torch.cat(kept)
+    return torch.cat([base[:0, :2], *kept])
 
 
 def sample_poses(cell: Cell, count: int, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> Tensor:

@@ -149,6 +149,13 @@ class Rules:
         outcome = xp.where(success, int(Outcome.SUCCESS), xp.where(failure, missed, int(Outcome.NONE)))
         return Verdict(earned, success | failure, outcome)
 
+    def motion_penalty(self, arm: Array, pose: Array, placed: Array) -> Array:
+        """What a commanded transfer costs for its path, (...): motion_weight * path cost in mm / 100; it does not depend on the goal."""
+        weight = self.config.reward.motion_weight
+        if weight == 0:
+            return 0 * placed[..., 0]
+        return weight * self.motion_cost(self.cell, arm, pose[..., :2], placed[..., :2]) / 100
+
     @property
     def tolerance_mm(self) -> float:
         """How far from the goal position a final placement may land: 1 um on exact hardware, else the setting."""
@@ -185,7 +192,7 @@ class Rules:
             verdict = self.judge(placed, goal, command.final, feasible, epsilon_rad)
             none, one = 0 * command.arm - 1, 0 * command.arm + 1
             after = xp.where(feasible, command.arm, previous_arm)
-            reward = self._less_motion(verdict.reward, command.arm, pose, placed)
+            reward = verdict.reward - self.motion_penalty(command.arm, pose, placed)
             return Transition(placed, after, placed, command, feasible, none, one, reward, verdict.terminated, verdict.outcome)
         return self._step_external(pose, goal, previous_arm, command, placed, feasible, transfers_left, epsilon_rad, noise)
 
@@ -206,19 +213,22 @@ class Rules:
         early = self.can_finish(pose, goal, epsilon_rad).any(-1)  # solved at the start: the action is ignored
         placed = one_where(early, pose, placed)
         feasible = feasible | early
-        able = self.can_finish(placed, goal, epsilon_rad)
         room = True if transfers_left is None else (early | (transfers_left > 1))
         verdict = self.judge(placed, goal, command.final, feasible, epsilon_rad)
         solved = verdict.terminated & room
-        external_arm = xp.where(solved, xp.argmax(able + 0.0, -1), -1)
+        able = self.can_finish(placed, goal, epsilon_rad)
+        error = abs(self.finishing_error(placed, goal))
+        # The arm that leaves the smaller error: a rule that favours neither side keeps the mirror law.
+        nearest = xp.argmin(xp.where(able, error, error + 2 * math.pi), -1)
+        external_arm = xp.where(solved, nearest, -1)
         finish = Command(solved, xp.where(solved, external_arm, command.arm), placed[..., :2])
         final_pose, _ = self.transfer(placed, goal, finish)
         if noise is not None:
             final_pose = self._displaced(final_pose, one_where(solved, noise, 0 * noise))
-        after = xp.where(solved, external_arm, xp.where(feasible & ~early, command.arm, previous_arm))
+        after = xp.where(solved, external_arm, xp.where(feasible, command.arm, previous_arm))
         transfers = xp.where(early, 0, 1) + xp.where(solved, 1, 0)
         outcome = xp.where(solved, verdict.outcome, int(Outcome.NONE))
-        reward = self._less_motion(xp.where(solved, verdict.reward, -xp.ones_like(verdict.reward)), command.arm, pose, placed)
+        reward = xp.where(solved, verdict.reward, -xp.ones_like(verdict.reward)) - self.motion_penalty(command.arm, pose, placed)
         pose = one_where(solved, final_pose, placed)
         return Transition(pose, after, placed, command, feasible, external_arm, transfers, reward, solved, outcome)
 
@@ -233,9 +243,3 @@ class Rules:
         xp = namespace(pose)
         moved = pose + offset
         return xp.concat([moved[..., :2], wrap(moved[..., 2:])], -1)
-
-    def _less_motion(self, reward: Array, arm: Array, pose: Array, placed: Array) -> Array:
-        weight = self.config.reward.motion_weight
-        if weight == 0:
-            return reward
-        return reward - weight * self.motion_cost(self.cell, arm, pose[..., :2], placed[..., :2]) / 100

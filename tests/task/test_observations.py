@@ -107,6 +107,15 @@ def test_relative_fields_say_what_their_names_say(cell, rules_of, draw):
     np.testing.assert_array_equal(field(vector, "was_previous"), previous[:, None] == [0, 1])
     np.testing.assert_array_equal(field(vector, "other_was_previous"), previous[:, None] == [1, 0])
     np.testing.assert_allclose(field(vector, "cos_finish_error"), np.cos(rules.finishing_error(pose, goal)), atol=1e-12)
+    own = np.array([-1.0, 1.0])  # the left arm sees the mirror image
+    error = rules.finishing_error(pose, goal)
+    in_epsilons = {name: np.clip(own * e / math.radians(40), -3, 3) / 3 for name, e in (("", error), ("other_", error[:, ::-1]))}
+    for name, expected in in_epsilons.items():
+        np.testing.assert_allclose(field(vector, f"{name}finish_error_in_epsilons"), expected, atol=1e-12)
+    np.testing.assert_allclose(field(vector, "sin_finish_error"), own * np.sin(error), atol=1e-12)
+    for name, place in (("", pose), ("goal_", goal)):
+        np.testing.assert_allclose(field(vector, f"{name}x"), place[:, :1] * [1, 1] / cell.r_max_mm)
+        np.testing.assert_allclose(field(vector, f"{name}y"), place[:, 1:2] * own / cell.r_max_mm)
     np.testing.assert_allclose(field(vector, "log_epsilon"), math.log(math.radians(40)) / 4)
     can = field(vector, "reaches_object") * field(vector, "reaches_goal") * (np.abs(field(vector, "finish_error_in_epsilons")) <= 1 / 3)
     np.testing.assert_array_equal(can.astype(bool), rules.can_finish(pose, goal))

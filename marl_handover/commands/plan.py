@@ -1,0 +1,181 @@
+"""``marl-handover plan``: one problem, solved by a policy on the exact kinematics, transfer by transfer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover.arrays import wrap
+from marl_handover.cell import NO_ARM, load_cell
+from marl_handover.cell.symmetry import ARM_LETTERS
+from marl_handover.config import CellConfig
+from marl_handover.errors import CheckpointMismatch, InvalidSetting, NotFinite, OutOfReach, WorkFailed
+from marl_handover.policies import SupervisorPolicy, load
+from marl_handover.task.planner import ExactPlanner
+from marl_handover.task.rules import Outcome, Rules
+
+Floats = NDArray[np.float64]
+
+
+@dataclass
+class PlanConfig:
+    """Keys of ``plan``. A trained policy brings its own cell and task; what is null here stays as it brought it."""
+
+    start: list[float] = field(default_factory=lambda: [-120.0, -60.0, 0.0])  # x [mm], y [mm], orientation [deg]
+    goal: list[float] = field(default_factory=lambda: [150.0, 60.0, 90.0])  # x [mm], y [mm], orientation [deg]
+    policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
+    cell: CellConfig | None = None  # null: the policy's own, or paper
+    architecture: str | None = None  # A or B; null: the policy's own, or B
+    epsilon_deg: float | None = None  # allowed orientation error; null: the policy's own, or 5
+    symmetry_order: int | None = None  # the block looks the same when turned by 360/k deg; null: the policy's own, or 1
+    seed: int = 0  # of policy=random
+    json: str = ""  # file for the sequence
+    picture: str = ""  # file for a picture of the sequence: .png, .pdf or .svg
+
+
+SCHEMA: type = PlanConfig
+ALIASES: dict[str, str] = {}
+GROUPS: dict[str, dict[str, type]] = {}
+
+
+def run(config: PlanConfig) -> int:
+    """Solve, print, write. Raises :class:`WorkFailed` if the policy does not reach the goal."""
+    from marl_handover.report.files import require_picture, save_figure, write_json
+
+    if config.picture:
+        require_picture("picture", config.picture)
+    poses = {name: _pose(name, getattr(config, name)) for name in ("start", "goal")}
+    policy = _policy(config)
+    rules = policy.rules
+    for name, pose in poses.items():
+        with np.errstate(over="ignore"):  # of absurd coordinates; infinitely far is out of reach too
+            reached = bool(rules.cell.reaches(pose).any())
+        if not reached:
+            raise OutOfReach(name, (float(pose[0]), float(pose[1])), rules.cell.r_min_mm, rules.cell.r_max_mm)
+    plan = solve(policy, poses["start"], poses["goal"])
+    print(_text(plan, rules))
+    if config.json:
+        write_json(Path(config.json), plan, "json")
+    if config.picture:
+        from marl_handover.report.plan import plan_figure
+
+        save_figure(plan_figure(plan, rules.cell), Path(config.picture), "picture")
+    if plan["outcome"] != Outcome.SUCCESS.name.lower():
+        raise WorkFailed(f"policy {policy.name!r} did not reach the goal: {plan['outcome']} after {counted(len(plan['transfers']))}")
+    return 0
+
+
+def solve(policy: SupervisorPolicy, start: Floats, goal: Floats) -> dict[str, Any]:
+    """What the policy does with one problem, poses (3,), on exact kinematics: the content of ``plan … json=FILE``, mm and rad."""
+    rules = policy.rules
+    pose, outcome = start, Outcome.NONE
+    previous: Any = np.int64(NO_ARM)
+    transfers: list[dict[str, Any]] = []
+    limit = rules.config.max_steps
+    while outcome is Outcome.NONE and len(transfers) < limit:
+        action = policy.act(pose, goal, previous)
+        result = rules.step(pose, goal, previous, action, transfers_left=np.int64(limit - len(transfers)))
+        external = int(result.external_arm)
+        if int(result.transfers) > (external >= 0):
+            transfers.append(
+                _transfer(rules, int(result.command.arm), bool(result.command.final), pose, result.placed, bool(result.feasible))
+            )
+        if external >= 0:
+            transfers.append(_transfer(rules, external, True, result.placed, result.pose, True))
+        pose, previous = result.pose, result.previous_arm
+        if result.terminated:
+            outcome = Outcome(int(result.outcome))
+    optimum = int(ExactPlanner(rules).plan(start, goal).transfers)
+    return {
+        "policy": policy.name,
+        "architecture": rules.config.architecture,
+        "cell": rules.cell.config.name,
+        "start": start.tolist(),
+        "goal": goal.tolist(),
+        "epsilon_deg": rules.config.epsilon_deg,
+        "symmetry_order": rules.config.symmetry_order,
+        "optimal_transfers": optimum or None,
+        "outcome": (Outcome.TIMEOUT if outcome is Outcome.NONE else outcome).name.lower(),
+        "transfers": transfers,
+        "total_path_mm": sum(transfer["path_mm"] for transfer in transfers),
+        "orientation_error_deg": math.degrees(rules.orientation_error(pose[2], goal[2])),
+        "cell_settings": asdict(rules.cell.config),
+    }
+
+
+def _transfer(rules: Rules, arm: int, final: bool, before: Floats, after: Floats, feasible: bool) -> dict[str, Any]:
+    """One entry of ``transfers``. A final transfer goes to the goal, not to a place of the chart, so it has no alpha and beta."""
+    alpha, beta = rules.cell.chart.from_table(after[:2])
+    inside = feasible and not final
+    return {
+        "arm": ARM_LETTERS[arm],
+        "final": final,
+        "from": before.tolist(),
+        "to": after.tolist(),
+        "alpha": float(alpha) if inside else None,
+        "beta": float(beta) if inside else None,
+        "path_mm": float(rules.motion_cost(rules.cell, np.int64(arm), before[:2], after[:2])),
+        "refused": not feasible,
+    }
+
+
+def _pose(name: str, values: list[float]) -> Floats:
+    """The pose (3,) in mm and rad of x [mm], y [mm], orientation [deg]."""
+    if len(values) != 3:
+        raise InvalidSetting(name, values, f"three numbers, {name}=[x_mm,y_mm,deg]")
+    if not all(math.isfinite(value) for value in values):
+        raise NotFinite(name, values)
+    return np.array([values[0], values[1], wrap(math.radians(values[2]))], float)
+
+
+def _policy(config: PlanConfig) -> SupervisorPolicy:
+    """The policy under its own cell and task, except where ``config`` says otherwise."""
+    own = load(config.policy, seed=config.seed)
+    named = {key: getattr(config, key) for key in ("architecture", "epsilon_deg", "symmetry_order")}
+    changes = {key: value for key, value in named.items() if value is not None}
+    # The rules are exact here: noise that a policy was trained with would only widen what counts as "at the goal".
+    task = replace(own.rules.config, **changes, noise=type(own.rules.config.noise)())
+    task.validate()
+    about: dict[str, Any] = getattr(own, "about", {})
+    if about and own.rules.external_finish and task.architecture == "B":
+        raise CheckpointMismatch(config.policy, "architecture", "A", "B")  # it never learned to say "final"
+    cell = own.rules.cell if config.cell is None else load_cell(config.cell)
+    return load(config.policy, cell, task, config.seed)
+
+
+def counted(count: int) -> str:
+    """``1 transfer``, ``2 transfers``."""
+    return f"{count} transfer{'' if count == 1 else 's'}"
+
+
+def _text(plan: dict[str, Any], rules: Rules) -> str:
+    """The sequence as a table, in mm and deg."""
+    goal_theta = plan["goal"][2]
+    lines = [
+        f"policy {plan['policy']}, architecture {plan['architecture']}, cell {plan['cell']}, epsilon {plan['epsilon_deg']:g} deg",
+        f"{'step':>4}  arm  final  {'x [mm]':>8} {'y [mm]':>8} {'theta [deg]':>12} {'to goal [deg]':>14} {'path [mm]':>10}  alpha, beta",
+    ]
+
+    def row(step: str, arm: str, final: str, pose: list[float], path: str = "", note: str = "") -> str:
+        left = math.degrees(rules.orientation_error(pose[2], goal_theta))
+        x, y, theta, left = (round(value, 2) + 0.0 for value in (pose[0], pose[1], math.degrees(pose[2]), left))  # + 0.0: no -0.0
+        return f"{step:>4}  {arm:<3}  {final:<5}  {x:8.1f} {y:8.1f} {theta:12.2f} {left:14.2f} {path:>10}  {note}".rstrip()
+
+    lines.append(row("0", "", "", plan["start"], note="start"))
+    for number, transfer in enumerate(plan["transfers"], start=1):
+        place = "" if transfer["alpha"] is None else f"{transfer['alpha']:+.3f}, {round(transfer['beta'], 3) + 0.0:+.3f}"
+        note = "refused: out of this arm's reach" if transfer["refused"] else place
+        path = f"{transfer['path_mm']:.1f}"
+        lines.append(row(str(number), transfer["arm"], "yes" if transfer["final"] else "no", transfer["to"], path, note))
+    lines.append(row("goal", "", "", plan["goal"]))
+    optimum = "none within the limit" if plan["optimal_transfers"] is None else plan["optimal_transfers"]
+    lines.append(
+        f"{plan['outcome']}: {counted(len(plan['transfers']))} (optimum {optimum}), path {plan['total_path_mm']:.1f} mm, "
+        f"orientation error {abs(plan['orientation_error_deg']):.2f} deg"
+    )
+    return "\n".join(lines)

@@ -1,0 +1,82 @@
+"""``marl-handover workspace``: what the arms of a cell reach, as numbers and a picture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from marl_handover.cell import CellModel, build_cell
+from marl_handover.cell.symmetry import ARM_LETTERS
+from marl_handover.config import CellConfig
+
+FILE, PICTURE = "workspace.json", "workspace.png"
+
+
+@dataclass
+class WorkspaceConfig:
+    """Keys of ``workspace``."""
+
+    cell: CellConfig = field(default_factory=CellConfig)
+    out: str = "runs/workspace"  # folder of workspace.json and workspace.png
+
+
+SCHEMA: type = WorkspaceConfig
+ALIASES: dict[str, str] = {}
+GROUPS: dict[str, dict[str, type]] = {}
+
+
+def run(config: WorkspaceConfig) -> int:
+    """Compute the cell, write both files, print the summary."""
+    from marl_handover.report.files import save_figure, write_json
+    from marl_handover.report.workspace import workspace_figure
+
+    model = build_cell(config.cell)
+    summary = workspace_summary(model)
+    out = Path(config.out)
+    write_json(out / FILE, summary, "out")
+    save_figure(workspace_figure(model), out / PICTURE)
+    print(_text(summary))
+    print(f"written: {out / FILE}, {out / PICTURE}")
+    return 0
+
+
+def workspace_summary(model: CellModel) -> dict[str, Any]:
+    """What ``workspace.json`` holds: mm and rad."""
+    cell, fit, masks = model.cell, model.fit, model.grid.masks
+    points = {letter: int(mask.sum()) for letter, mask in zip(ARM_LETTERS, masks, strict=True)}
+    return {
+        "cell": cell.config.name,
+        "r_min_mm": fit.r_min_mm,
+        "r_max_mm": fit.r_max_mm,
+        "base_distance_mm": cell.config.base_distance_mm,
+        "yaw_range_rad": [fit.yaw_lower_rad, fit.yaw_upper_rad],
+        "x_max_mm": cell.chart.x_max_mm,
+        "y_max_at_0_mm": float(cell.chart.y_max_mm(np.float64(0.0))),
+        "chart_inset": cell.chart.inset,
+        "pick_height_mm": cell.config.pick_height_mm,
+        "bases": {letter: [base.x_mm, base.y_mm] for letter, base in zip(ARM_LETTERS, cell.bases, strict=True)},
+        "grid_mm": cell.config.grid_mm,
+        "grid_points": {**points, "both": int(masks.all(0).sum())},
+        "fit": {"false_inside_rate": fit.false_inside_rate, "missed_rate": fit.missed_rate},
+    }
+
+
+def _text(summary: dict[str, Any]) -> str:
+    low, high = (math.degrees(value) for value in summary["yaw_range_rad"])
+    points = summary["grid_points"]
+    rows = {
+        "cell": summary["cell"],
+        "annulus": f"{summary['r_min_mm']:g} to {summary['r_max_mm']:g} mm",
+        "base yaw": f"{low:.1f} to {high:.1f} deg",
+        "base distance": f"{summary['base_distance_mm']:g} mm",
+        "shared space": f"|x| <= {summary['x_max_mm']:.1f} mm, |y| <= {summary['y_max_at_0_mm']:.1f} mm at x = 0, "
+        f"chart inset {summary['chart_inset']:g}",
+        "pick height": f"{summary['pick_height_mm']:g} mm",
+        "grid points": ", ".join(f"{name} {count}" for name, count in points.items()) + f", every {summary['grid_mm']:g} mm",
+        "fit": f"{summary['fit']['false_inside_rate']:.2%} of the points inside out of reach, {summary['fit']['missed_rate']:.2%} missed",
+    }
+    return "\n".join(f"{name:<14} {value}" for name, value in rows.items())

@@ -1,0 +1,143 @@
+"""The evaluation figure: how episodes ended, and how many transfers they took against the optimum."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from marl_handover.errors import CorruptFile, MissingFile
+from marl_handover.report.palette import BLUE, FAINT, GREY, OUTCOMES, YELLOW
+from marl_handover.report.table import Axes
+
+
+class Played(NamedTuple):
+    """Successful episodes of a trace: start and goal (n, 3) in mm and rad, transfers int (n,)."""
+
+    start: NDArray[np.float64]
+    goal: NDArray[np.float64]
+    transfers: NDArray[np.int64]
+
+
+def read_trace(path: Path) -> Played:
+    """The successful episodes of a trace that ``evaluate`` wrote. Raises :class:`MissingFile` or :class:`CorruptFile`."""
+    if not path.is_file():
+        raise MissingFile("trace", path)
+    first: dict[int, tuple[list[float], list[float]]] = {}
+    count: dict[int, int] = {}
+    solved: set[int] = set()
+    with path.open(encoding="utf-8") as stream:
+        for number, line in enumerate(stream, start=1):
+            try:
+                row = json.loads(line)
+                episode = int(row["episode"])
+                first.setdefault(episode, (_pose(row["state"]), _pose(row["goal"])))
+                count[episode] = count.get(episode, 0) + 1
+                if row["outcome"] == "success":
+                    solved.add(episode)
+            except (ValueError, KeyError, TypeError) as error:
+                raise CorruptFile("trace", path, f"line {number} is no step of an episode") from error
+    if not first:
+        raise CorruptFile("trace", path, "it holds no step")
+    start, goal = (np.array([first[episode][column] for episode in sorted(solved)], float).reshape(-1, 3) for column in (0, 1))
+    return Played(start, goal, np.array([count[episode] for episode in sorted(solved)], int))
+
+
+def _pose(value: Any) -> list[float]:
+    x_mm, y_mm, theta_rad = (float(number) for number in value)
+    return [x_mm, y_mm, theta_rad]
+
+
+def check_evaluation(result: Mapping[str, Any], path: Path) -> None:
+    """Raise :class:`CorruptFile` unless ``result``, read from ``path``, has what the figure needs."""
+    try:
+        counts = [int(result["outcomes"][name]) for name in OUTCOMES]
+        if min(counts) < 0 or sum(counts) < 1:
+            raise ValueError("it counts no episodes")
+        low, high = (float(value) for value in result["success_ci95"])
+        [float(value) for value in (low, high, result["success_rate"], result["mean_steps"], result["epsilon_deg"])]
+        [float(result[name]) for name in ("mean_steps_success", "optimal_mean_steps") if result[name] is not None]
+        str(result["policy"])
+    except KeyError as error:
+        raise CorruptFile("evaluation", path, f"it lacks {error.args[0]!r}") from error
+    except (TypeError, ValueError) as error:
+        raise CorruptFile("evaluation", path, str(error)) from error
+
+
+def evaluation_figure(
+    result: Mapping[str, Any], transfers: NDArray[np.int64] | None = None, optimal: NDArray[np.int64] | None = None
+) -> Figure:
+    """Outcomes, and transfers against the optimum.
+
+    Args:
+        result: what ``evaluate … json=FILE`` wrote.
+        transfers: of each successful episode (n,), for a histogram; without them the means are shown.
+        optimal: fewest transfers of the same episodes (n,).
+    """
+    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _outcomes(left, result)
+    if transfers is not None and optimal is not None and len(transfers):
+        _histogram(right, transfers, optimal)
+    else:
+        _means(right, result)
+    name = Path(str(result["policy"])).name
+    kind = f"architecture {result['architecture']}, " if "architecture" in result else ""
+    figure.suptitle(f"policy {name}: {kind}ε = {result['epsilon_deg']:g}°, {sum(result['outcomes'].values()):,} episodes", fontsize=10)
+    return figure
+
+
+def _outcomes(axes: Axes, result: Mapping[str, Any]) -> None:
+    counts = [int(result["outcomes"][name]) for name in OUTCOMES]
+    shares = [100 * count / sum(counts) for count in counts]
+    bars = axes.bar([name.replace("_", "\n") for name in OUTCOMES], shares, color=list(OUTCOMES.values()), width=0.7)
+    axes.bar_label(bars, [f"{share:.2f} %\n({count:,})" for share, count in zip(shares, counts, strict=True)], fontsize=8, padding=2)
+    axes.set_ylim(0, 118)
+    axes.set_yticks(range(0, 101, 20))
+    axes.set_ylabel("episodes [%]")
+    low, high = (100 * float(value) for value in result["success_ci95"])
+    axes.set_title(f"success, 95 % interval: {low:.2f} to {high:.2f} %", fontsize=9)
+    _tidy(axes)
+
+
+def _histogram(axes: Axes, transfers: NDArray[np.int64], optimal: NDArray[np.int64]) -> None:
+    numbers = np.arange(1, max(transfers.max(), optimal.max()) + 1)
+    for values, label, colour, shift in ((optimal, "optimum", YELLOW, -0.2), (transfers, "policy", BLUE, 0.2)):
+        share = [100 * float(np.mean(values == number)) for number in numbers]
+        axes.bar(numbers + shift, share, width=0.4, color=colour, label=f"{label}, mean {values.mean():.2f}")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("transfers")
+    axes.set_ylabel("successful episodes [%]")
+    axes.set_title(f"transfers of {len(transfers):,} successful episodes", fontsize=9)
+    axes.margins(y=0.2)  # room for the legend
+    axes.legend(fontsize=8, frameon=False, ncols=2, loc="upper center")
+    _tidy(axes)
+
+
+def _means(axes: Axes, result: Mapping[str, Any]) -> None:
+    wanted = (
+        ("optimum", "optimal_mean_steps", YELLOW),
+        ("policy,\nsuccesses", "mean_steps_success", BLUE),
+        ("policy,\nall episodes", "mean_steps", GREY),
+    )
+    known = [(label, float(result[key]), colour) for label, key, colour in wanted if result.get(key) is not None]
+    bars = axes.bar([label for label, _, _ in known], [value for _, value, _ in known], color=[colour for _, _, colour in known], width=0.6)
+    axes.bar_label(bars, [f"{value:.3f}" for _, value, _ in known], fontsize=8, padding=2)
+    axes.margins(y=0.12)
+    axes.set_ylabel("mean transfers")
+    ratio = result.get("steps_ratio")
+    axes.set_title("" if ratio is None else f"transfers ÷ optimum, over successes: {ratio:.3f}", fontsize=9)
+    _tidy(axes)
+
+
+def _tidy(axes: Axes) -> None:
+    axes.grid(axis="y", color=FAINT, linewidth=0.5)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)

@@ -1,0 +1,102 @@
+"""The table from above: bases, annulus sectors, the chart, and the block. World frame, mm; x to the right, y up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.patches import Circle, Polygon
+from numpy.typing import NDArray
+
+from marl_handover.cell.cell import Cell
+from marl_handover.cell.symmetry import ARM_LETTERS
+from marl_handover.report.palette import FAINT, INK, PAPER, arm_colour, arm_line
+
+Axes = Any
+"""matplotlib's, which has no types of its own here."""
+
+Floats = NDArray[np.float64]
+
+
+def sector_mm(cell: Cell, arm: int, points: int = 90) -> Floats:
+    """Outline (n, 2) of an arm's annulus sector."""
+    base = cell.bases[arm]
+    angle = base.facing_rad + np.linspace(*cell.yaw_rad, points)
+    ray = np.stack([np.cos(angle), np.sin(angle)], -1)
+    return np.array([base.x_mm, base.y_mm]) + np.concatenate([cell.r_max_mm * ray, cell.r_min_mm * ray[::-1]])
+
+
+def frame_table(axes: Axes, cell: Cell, margin_mm: float = 25.0) -> None:
+    """Equal axes around all that the arms reach, bases included."""
+    points = np.concatenate([sector_mm(cell, arm) for arm in range(cell.num_arms)])
+    points = np.concatenate([points, [(base.x_mm, base.y_mm) for base in cell.bases]])
+    low, high = points.min(0) - margin_mm, points.max(0) + margin_mm
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal")
+
+
+def draw_sectors(axes: Axes, cell: Cell, strength: float = 0.1, width: float = 1.2, labelled: bool = False) -> None:
+    """Annulus sector of each arm; its straight sides are the yaw limits."""
+    for arm in range(cell.num_arms):
+        outline, colour = sector_mm(cell, arm), arm_colour(arm)
+        axes.add_patch(Polygon(outline, closed=True, facecolor=colour, edgecolor="none", alpha=strength, zorder=1))
+        label = f"annulus sector of {ARM_LETTERS[arm]}" if labelled else None
+        edge = Polygon(outline, closed=True, fill=False, edgecolor=colour, linewidth=width, linestyle=arm_line(arm), label=label, zorder=3)
+        axes.add_patch(edge)
+
+
+def draw_circles(axes: Axes, cell: Cell) -> None:
+    """Both whole circles around each base, faint, to show what the yaw limits cut off."""
+    for arm, base in enumerate(cell.bases):
+        for radius in (cell.r_min_mm, cell.r_max_mm):
+            colour = arm_colour(arm)
+            circle = Circle((base.x_mm, base.y_mm), radius, fill=False, edgecolor=colour, linewidth=0.6, linestyle=":", alpha=0.6, zorder=2)
+            axes.add_patch(circle)
+
+
+def draw_bases(axes: Axes, cell: Cell, size: float = 13.0) -> None:
+    """A lettered square at each base; ``size`` in points."""
+    for arm, base in enumerate(cell.bases):
+        axes.plot(base.x_mm, base.y_mm, "s", color=arm_colour(arm), markersize=size, zorder=11)
+        letter = {"color": PAPER, "ha": "center", "va": "center", "fontsize": 0.65 * size, "fontweight": "bold", "zorder": 12}
+        axes.text(base.x_mm, base.y_mm, ARM_LETTERS[arm], **letter)
+
+
+def draw_chart(axes: Axes, cell: Cell, inner: Sequence[float] = (-0.5, 0.0, 0.5), label: str | None = "chart (α, β)") -> None:
+    """Outline of the chart, and lines of constant alpha and beta at ``inner``."""
+    along = np.linspace(-1.0, 1.0, 201)
+    for value in (-1.0, *inner, 1.0):
+        border = abs(value) == 1
+        style = {"color": INK, "linewidth": 1.4 if border else 0.6, "zorder": 4}
+        for line in (cell.chart.to_table(along, value + 0 * along), cell.chart.to_table(value + 0 * along, along)):
+            axes.plot(line[:, 0], line[:, 1], label=label if border else None, **style)
+            label = label if not border else None
+
+
+def square_mm(pose: Sequence[float], side_mm: float) -> Floats:
+    """Corners (4, 2) of the block at ``pose``: x [mm], y [mm], theta [rad]."""
+    corners = side_mm / 2 * np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    return np.array(pose[:2], float) + corners @ np.array([(cos, sin), (-sin, cos)])
+
+
+def draw_block(axes: Axes, pose: Sequence[float], side_mm: float, colour: str, face: str = "none", line: str = "-", order: int = 5) -> None:
+    """The block, with an arrow from its centre along its orientation."""
+    axes.add_patch(
+        Polygon(square_mm(pose, side_mm), closed=True, facecolor=face, edgecolor=colour, linewidth=1.3, linestyle=line, zorder=order)
+    )
+    reach = 0.95 * side_mm
+    tip = (pose[0] + reach * math.cos(pose[2]), pose[1] + reach * math.sin(pose[2]))
+    arrow = {"arrowstyle": "-|>", "color": colour, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 9}
+    axes.annotate("", xy=tip, xytext=(pose[0], pose[1]), arrowprops=arrow, zorder=order + 1)
+
+
+def bare(axes: Axes) -> None:
+    """No ticks, and a faint frame."""
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color(FAINT)

@@ -1,0 +1,143 @@
+"""``marl-handover plot``: every kind gives a picture, every bad input one line."""
+
+from __future__ import annotations
+
+import json
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from marl_handover import cli
+from marl_handover.commands.plot import run_folders
+
+HEADER = "step,gradient_step,epsilon_low_deg,epsilon_high_deg,success_rate,steps_ratio"
+
+
+def colours(path):
+    image = matplotlib.image.imread(path)
+    return len(np.unique((255 * image[..., :3]).astype(np.uint8).reshape(-1, 3), axis=0))
+
+
+@pytest.fixture
+def make_run(tmp_path):
+    def make(name, steps):
+        folder = tmp_path / name
+        folder.mkdir()
+        rows = [f"{step},{step // 8},{15 if step < 300 else 5},15,{min(step / 500, 1)},{'' if step < 200 else 1.2}" for step in steps]
+        (folder / "metrics.csv").write_text("\n".join([HEADER, *rows]) + "\n")
+        return folder
+
+    return make
+
+
+@pytest.fixture
+def evaluation(tmp_path):
+    """An evaluation's JSON and its trace: two episodes, one solved."""
+    result = {
+        "policy": "runs/a", "architecture": "B", "epsilon_deg": 5.0, "success_rate": 0.5, "success_ci95": [0.1, 0.9], "mean_steps": 2.5,
+        "mean_steps_success": 2.0, "optimal_mean_steps": 2.0, "steps_ratio": 1.0,
+        "outcomes": {"success": 1, "wrong_orientation": 0, "wrong_position": 0, "timeout": 1},
+    }  # fmt: skip
+    rows = [
+        {"episode": 0, "state": [-120, -60, 0], "goal": [150, 60, 0.0], "outcome": None},
+        {"episode": 0, "state": [0, 0, 0], "goal": [150, 60, 0.0], "outcome": "success"},
+        {"episode": 1, "state": [-120, -60, 0], "goal": [150, 60, 1.5], "outcome": "timeout"},
+    ]
+    (tmp_path / "evaluation.json").write_text(json.dumps(result))
+    (tmp_path / "trace.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return tmp_path / "evaluation.json", tmp_path / "trace.jsonl"
+
+
+def test_one_run(make_run, capsys):
+    folder = make_run("a=b,c", range(100, 700, 100))
+    assert cli.main(["plot", f"run={folder.parent}/a=b", "kind=run"]) == 2
+    folder = folder.rename(folder.parent / "a=b")
+    capsys.readouterr()
+    assert cli.main(["plot", f"run={folder}"]) == 0
+    assert capsys.readouterr().out == f"written: {folder}/learning.png\n"
+    assert colours(folder / "learning.png") > 20
+    assert {path.name for path in folder.iterdir()} == {"metrics.csv", "learning.png"}
+
+
+def test_seeds_and_runs_that_have_just_begun(make_run, tmp_path):
+    first, second = make_run("a", range(100, 700, 100)), make_run("b", [150, 250])
+    begun = make_run("c", [50])
+    assert cli.main(["plot", f"run=[{first},{second}]"]) == 0
+    assert colours(tmp_path / "learning.png") > 20
+    for runs, out in ((f"{begun}", "one.pdf"), (f"[{second}, {begun}]", "apart.png")):
+        assert cli.main(["plot", f"run={runs}", f"out={tmp_path}/new/{out}"]) == 0
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {"one.pdf", "apart.png"}
+
+
+def test_run_folders():
+    assert [str(path) for path in run_folders("[a, 'b=c',d]")] == ["a", "b=c", "d"]
+
+
+def test_workspace_and_plan(tmp_path, capsys):
+    assert cli.main(["plot", "kind=workspace", "cell=al5a", f"out={tmp_path / 'w.png'}"]) == 0
+    assert colours(tmp_path / "w.png") > 20
+    assert cli.main(["plan", "cell=al5a", f"json={tmp_path / 'plan.json'}", f"picture={tmp_path / 'same.png'}"]) == 0
+    assert cli.main(["plot", "kind=plan", f"json={tmp_path / 'plan.json'}"]) == 0
+    # The file holds the cell's settings, so the picture is the one that plan drew.
+    np.testing.assert_array_equal(matplotlib.image.imread(tmp_path / "plan.png"), matplotlib.image.imread(tmp_path / "same.png"))
+
+
+def test_evaluation(evaluation, tmp_path):
+    result, trace = evaluation
+    assert cli.main(["plot", "kind=evaluation", f"json={result}"]) == 0
+    assert cli.main(["plot", "kind=evaluation", f"json={result}", f"trace={trace}", f"out={tmp_path / 'histogram.png'}"]) == 0
+    assert colours(tmp_path / "evaluation.png") > 20
+    assert colours(tmp_path / "histogram.png") > 20
+
+
+def test_an_evaluation_without_a_success(evaluation):
+    path, _ = evaluation
+    result = json.loads(path.read_text())
+    result |= {"mean_steps_success": None, "steps_ratio": None, "outcomes": {**result["outcomes"], "success": 0}}
+    path.write_text(json.dumps(result))
+    assert cli.main(["plot", "kind=evaluation", f"json={path}"]) == 0
+
+
+def test_a_trace_of_something_else(evaluation, capsys):
+    result, trace = evaluation
+    for arguments, said in ((["cell=al5a"], "must be the cell of the trace"), ([f"json={result}"], "of the same evaluation")):
+        if said.startswith("of"):
+            trace.write_text(trace.read_text().replace('"timeout"', '"success"'))
+        assert cli.main(["plot", "kind=evaluation", f"json={result}", f"trace={trace}", *arguments]) == 2
+        assert said in capsys.readouterr().err
+    trace.write_text('{"episode": 0}\n')
+    assert cli.main(["plot", "kind=evaluation", f"json={result}", f"trace={trace}"]) == 2
+    assert "line 1 is no step" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["kind=runs"], "kind = 'runs' is not known; choose one of: run, workspace, plan, evaluation"),
+        ([], "run = '': must be a run directory"),
+        (["run=[]"], "run = '[]': must be a run directory"),
+        (["run=none"], "run directory not found: none"),
+        (["run=."], "metrics not found: metrics.csv"),
+        (["run=broken"], "metrics broken/metrics.csv cannot be read: line 2"),
+        (["run=broken", "out=a.txt"], "out = 'a.txt': must be a file that ends in"),
+        (["kind=plan"], "json = '': must be the file that `marl-handover plan json=FILE` wrote"),
+        (["kind=plan", "json=none.json"], "plan not found: none.json"),
+        (["kind=plan", "json=empty.json"], "plan empty.json cannot be read: it lacks 'start'"),
+        (["kind=evaluation", "json=empty.json"], "evaluation empty.json cannot be read: it lacks 'outcomes'"),
+        (["kind=evaluation", "json=broken/metrics.csv"], "evaluation broken/metrics.csv cannot be read"),
+        (["run=broken", "colour=red"], "unknown key 'colour'"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "metrics.csv").write_text(HEADER + "\n1,2,3,x,5,6\n")
+    (tmp_path / "empty.json").write_text("{}")
+    before = sorted(tmp_path.rglob("*"))
+    assert cli.main(["plot", *arguments]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("marl-handover plot: ")
+    assert said in err
+    assert err.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before

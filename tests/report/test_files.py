@@ -1,0 +1,48 @@
+"""Results are written whole or not at all."""
+
+from __future__ import annotations
+
+import pytest
+from matplotlib.figure import Figure
+
+from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
+from marl_handover.report.files import read_json, require_picture, save_figure, write_json
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.pdf", "a.SVG", "new/folder/a.png"])
+def test_pictures_by_suffix(tmp_path, name):
+    figure = Figure(figsize=(1, 1))
+    figure.add_subplot()
+    save_figure(figure, tmp_path / name)
+    start = (tmp_path / name).read_bytes()[:5]
+    assert start in (b"\x89PNG\r", b"%PDF-", b"<?xml")
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+def test_other_suffixes_and_folders_are_refused(tmp_path):
+    with pytest.raises(InvalidSetting, match="ends in .png, .pdf or .svg"):
+        require_picture("out", "a.gif")
+    (tmp_path / "a.png").mkdir()
+    with pytest.raises(InvalidSetting, match="can be written"):
+        save_figure(Figure(), tmp_path / "a.png")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InvalidSetting, match="can be written"):
+        write_json(tmp_path / "file" / "a.json", {}, "json")
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, {"a": 1}, "json")
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(path, {"a": float("nan")}, "json")
+    assert read_json(path, "plan") == {"a": 1}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_reading_json(tmp_path):
+    with pytest.raises(MissingFile):
+        read_json(tmp_path / "none.json", "plan")
+    for text in ("[1]", "{", ""):
+        (tmp_path / "a.json").write_text(text)
+        with pytest.raises(CorruptFile):
+            read_json(tmp_path / "a.json", "plan")
