@@ -1,7 +1,7 @@
 # Needs Linux, make and Python 3.11 (or 3.12) with venv and pip; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow check format bench wheel clean
+.PHONY: help demo test test-slow check format bench pretrained wheel clean
 
 SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
 PYTHON ?= $(firstword $(foreach p,python3.11 python3 python3.12,$(shell $(p) -c "$(SUITABLE)" 2>/dev/null && echo $(p))))
@@ -16,7 +16,8 @@ help:
 	@echo "make demo       install, train a supervisor, evaluate it against the exact planner, leave pictures in runs/"
 	@echo "make test       install and run the tests; make test-slow runs the slow ones too"
 	@echo "make check      style, types and import layers; make format repairs the style"
-	@echo "make bench      measure speed"
+	@echo "make bench      measure speed, and learning against Stable-Baselines3 (hours)"
+	@echo "make pretrained train the two policies that are shipped"
 	@echo "make wheel      build a wheel into dist/"
 
 $(STAMP): pyproject.toml constraints.txt
@@ -51,7 +52,15 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 bench: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,peers]"
 	$(BIN)/python bench/run.py
+
+# The policies that travel in the wheel; see the origin stored in each file.
+pretrained: $(STAMP)
+	$(RUN) train preset=pretrained architecture=A out=runs/pretrained_a
+	$(BIN)/python scripts/export_policy.py runs/pretrained_a marl_handover/pretrained/a.npz
+	$(RUN) train preset=pretrained architecture=B out=runs/pretrained_b
+	$(BIN)/python scripts/export_policy.py runs/pretrained_b marl_handover/pretrained/b.npz
 
 wheel: $(STAMP)
 	$(BIN)/python -m build --wheel --outdir dist .

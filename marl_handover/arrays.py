@@ -34,6 +34,8 @@ def wrap(angle_rad: Array) -> Array:
 def select(values: Array, index: Array) -> Array:
     """``values[..., index]`` elementwise: ``values`` of shape (..., n), integer ``index`` of shape (...), result of shape (...)."""
     if isinstance(values, np.ndarray):
+        if values.ndim == 1:
+            return values[int(index)]
         return np.take_along_axis(values, np.asarray(index)[..., None], axis=-1)[..., 0]
     return values.gather(-1, index.unsqueeze(-1)).squeeze(-1)
 

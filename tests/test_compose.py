@@ -110,10 +110,12 @@ def test_quotes_and_null(make):
 
 
 def test_dictionaries(make):
-    assert make("cell.joint_limits_deg.elbow=[0,90]").cell.joint_limits_deg == {"elbow": [0.0, 90.0]}
-    assert make("cell.joint_limits_deg={elbow:[0,90],wrist:[1,2]}").cell.joint_limits_deg == {"elbow": [0.0, 90.0], "wrist": [1.0, 2.0]}
+    limits = CellConfig().joint_limits_deg
+    assert make("cell.joint_limits_deg.elbow=[0,90]").cell.joint_limits_deg == limits | {"elbow": [0.0, 90.0]}
+    both = make("cell.joint_limits_deg={elbow:[0,90],wrist:[1,2]}").cell.joint_limits_deg
+    assert both == limits | {"elbow": [0.0, 90.0], "wrist": [1.0, 2.0]}
     assert make("task.reward={success:10,step:-3}").task.reward.success == 10.0
-    assert make("+cell.joint_limits_deg.elbow=[0,9]").cell.joint_limits_deg == {"elbow": [0.0, 9.0]}
+    assert make("+cell.joint_limits_deg.elbow=[0,9]").cell.joint_limits_deg["elbow"] == [0.0, 9.0]
 
 
 def test_shorthands(make):
@@ -124,7 +126,7 @@ def test_shorthands(make):
 def test_yaml_options(make, tmp_path, monkeypatch):
     toy = make("cell=al5a")
     assert (toy.cell.base_distance_mm, toy.cell.block.side_mm, toy.cell.name) == (300.0, 30.0, "al5a")
-    assert toy.cell.joint_limits_deg == {"elbow": [-10.0, 20.0], "a.b": [0.0, 1.0]}
+    assert toy.cell.joint_limits_deg == CellConfig().joint_limits_deg | {"elbow": [-10.0, 20.0], "a.b": [0.0, 1.0]}
     assert make("cell=other").cell.name == "mine"
     (tmp_path / "my").mkdir()
     (tmp_path / "my" / "own.yaml").write_text("base_distance_mm: 333\n")

@@ -8,6 +8,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
+
+import numpy as np
 
 from marl_handover.arrays import Array, namespace
 from marl_handover.cell.chart import Chart
@@ -84,20 +87,31 @@ class Cell:
     def polar(self, position_mm: Array) -> tuple[Array, Array]:
         """Squared radius [mm^2] and base yaw [rad] of positions (..., >= 2) seen from each arm, both (..., num_arms)."""
         xp = namespace(position_mm)
-        x_mm, y_mm = position_mm[..., 0], position_mm[..., 1]
-        squares, yaws = [], []
-        for base in self.bases:
-            dx, dy = x_mm - base.x_mm, y_mm - base.y_mm
-            forward = base.facing[0] * dx + base.facing[1] * dy
-            left = base.facing[0] * dy - base.facing[1] * dx
-            squares.append(forward * forward + left * left)
-            yaws.append(xp.atan2(left, forward))
-        return xp.stack(squares, -1), xp.stack(yaws, -1)
+        base_x, base_y, facing_x, facing_y, _ = self._constants(position_mm)
+        dx, dy = position_mm[..., 0:1] - base_x, position_mm[..., 1:2] - base_y
+        forward = facing_x * dx + facing_y * dy
+        left = facing_x * dy - facing_y * dx
+        return forward * forward + left * left, xp.atan2(left, forward)
+
+    def _constants(self, like: Array) -> Array:
+        """The bases' x, y, facing vector and facing angle as arrays (5, num_arms) of the kind of ``like``; made once for each kind."""
+        key = (like.dtype, getattr(like, "device", None))
+        if key not in self._kinds:
+            rows = [[base.x_mm, base.y_mm, *base.facing, base.facing_rad] for base in self.bases]
+            table = np.array(rows, np.float64).T
+            if isinstance(like, (np.ndarray, np.generic)):
+                self._kinds[key] = table.astype(like.dtype)
+            else:
+                self._kinds[key] = like.new_tensor(table.tolist())
+        return self._kinds[key]
+
+    @cached_property
+    def _kinds(self) -> dict[Any, Array]:
+        return {}
 
     def gripper_yaw(self, yaw_rad: Array) -> Array:
         """World yaw psi of each gripper, (..., num_arms), from base yaws; not wrapped."""
-        xp = namespace(yaw_rad)
-        return xp.stack([yaw_rad[..., index] + base.facing_rad for index, base in enumerate(self.bases)], -1)
+        return yaw_rad + self._constants(yaw_rad)[4]
 
     def within(self, square_mm2: Array, yaw_rad: Array) -> Array:
         """Whether squared radius and base yaw lie in the annulus sector, to 1 um; elementwise."""

@@ -29,7 +29,7 @@ class PlanConfig:
     start: list[float] = field(default_factory=lambda: [-120.0, -60.0, 0.0])  # x [mm], y [mm], orientation [deg]
     goal: list[float] = field(default_factory=lambda: [150.0, 60.0, 90.0])  # x [mm], y [mm], orientation [deg]
     policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
-    cell: CellConfig | None = None  # null: the policy's own, or paper
+    cell: CellConfig | None = None  # null: the policy's own, or paper; single keys change the paper cell
     architecture: str | None = None  # A or B; null: the policy's own, or B
     epsilon_deg: float | None = None  # allowed orientation error; null: the policy's own, or 5
     symmetry_order: int | None = None  # the block looks the same when turned by 360/k deg; null: the policy's own, or 1

@@ -109,23 +109,29 @@ class HybridSacLoss(LossModule):
         weight = soft.probability[..., 1:].detach()
         place_entropy = -(weight * soft.place_log_prob).sum() / weight.sum().clamp_min(1e-6)
         loss = -soft.value.mean()
-        if candidates.shape[2]:
-            loss = loss + self.config.candidate_weight * self._candidate_loss(batch, candidates)
+        if candidates.numel():
+            some = {key: value[: len(candidates)] for key, value in batch.items()}
+            loss = loss + self.config.candidate_weight * self._candidate_loss(some, candidates)
         return loss, soft.branch_entropy.mean().detach(), place_entropy.detach()
 
     def _candidate_loss(self, batch: dict[str, Tensor], candidates: Tensor) -> Tensor:
-        """Squared distance of each arm's nearest mode to the best of ``candidates`` (n, arms, m, 2), weighted by how much better it is."""
+        """Squared distance of each arm's best mode to the *nearest* of the ``candidates`` (n, arms, m, 2) that beat it by the margin.
+
+        The nearest, not the best: between two equally good regions, drawing towards now one, now the other would leave the
+        mean in the bad middle.
+        """
         mean = self.actor(batch["observation"]).mean.tanh()
         modes = mean.shape[2]
         with torch.no_grad():
             places = torch.cat([mean, candidates], 2)
             value = self.critic.value_place(self.afterstates(batch["pose"], batch["goal"], places, batch["epsilon"])).amin(0)
-            best_value, best = value[..., modes:].max(-1)
-            target = candidates.gather(2, best[..., None, None].expand(-1, -1, 1, 2))
-            nearest = (mean - target).square().sum(-1).argmin(-1)
-            weight = (best_value - value[..., :modes].amax(-1) - self.config.candidate_margin).clamp(0.0, 1.0)
-        chosen = mean.gather(2, nearest[..., None, None].expand(-1, -1, 1, 2))
-        return (weight * (chosen - target).square().sum((-2, -1))).sum(-1).mean()
+            mode_value, mode = value[..., :modes].max(-1)
+        chosen = mean.gather(2, mode[..., None, None].expand(-1, -1, 1, 2))
+        gain = value[..., modes:] - mode_value[..., None] - self.config.candidate_margin
+        distance = (chosen - candidates).square().sum(-1)
+        nearest = torch.where(gain > 0, distance.detach(), torch.inf).argmin(-1, keepdim=True)
+        weight = gain.gather(-1, nearest).clamp(0.0, 1.0)
+        return (weight * distance.gather(-1, nearest)).sum((-2, -1)).mean()
 
     def temperature_loss(self, branch_entropy: Tensor, place_entropy: Tensor, targets: tuple[float, float]) -> Tensor:
         """Raises a temperature whose entropy (of places, of branches) is below its target."""
@@ -137,7 +143,7 @@ class HybridSacLoss(LossModule):
         batch, following = unpacked(tensordict)
         shape = (len(tensordict), self.rules.cell.num_arms, self.actor.modes, 2)
         noise = torch.randn(2, *shape, device=tensordict.device)
-        candidates = torch.zeros(*shape[:2], 0, 2, device=tensordict.device)
+        candidates = torch.zeros(0, shape[1], 0, 2, device=tensordict.device)
         critic = self.critic_loss(batch, following, noise[0])
         actor, branch, place = self.actor_loss(batch, noise[1], candidates)
         return TensorDict({"loss_qvalue": critic, "loss_actor": actor, "entropy_branch": branch, "entropy_place": place})
@@ -175,8 +181,8 @@ class HybridSac(Algorithm):
         own = self.config
         can_finish = not rules.external_finish
         actor = HybridActor(rules.cell, own.actor_hidden, own.modes, can_finish, own.canonical, own.harmonics).to(self.device)
-        critic = AfterstateCritic(own.critic_hidden, own.canonical, own.harmonics).to(self.device)
-        target = AfterstateCritic(own.critic_hidden, own.canonical, own.harmonics).to(self.device).requires_grad_(False)
+        critic = AfterstateCritic(own.critic_hidden, own.final_hidden, own.canonical, own.harmonics).to(self.device)
+        target = AfterstateCritic(own.critic_hidden, own.final_hidden, own.canonical, own.harmonics).to(self.device).requires_grad_(False)
         target.load_state_dict(critic.state_dict())
         self.loss = HybridSacLoss(rules, actor, critic, target, own).to(self.device)
         adam: dict[str, Any] = {"lr": own.learning_rate, "fused": True}
@@ -218,12 +224,15 @@ class HybridSac(Algorithm):
     def explore(self, observation: Tensor) -> Tensor:
         """A branch and a place drawn from the policy."""
         branches = self.loss.actor(observation)
-        place, _ = squashed_sample(branches, self._noise(branches.mean.shape))
+        # Some cells follow the deterministic policy: where that goes in circles, its states must get into the memory.
+        curious = torch.arange(len(observation), device=self.device) >= int(self.config.greedy_share * len(observation))
+        place, _ = squashed_sample(branches, self._noise(branches.mean.shape) * curious[:, None, None, None])
         uniform = torch.rand(branches.logits.flatten(1).shape, generator=self.generator, device=self.device)
         gumbel = -(-uniform.clamp_min(1e-20).log()).log()
         blind = torch.rand(place.shape[:-1], generator=self.generator, device=self.device) < self.config.random_place
+        blind &= curious[:, None, None]
         place = torch.where(blind[..., None], self._anywhere(place.shape), place)
-        return chosen_action(branches.logits, place, gumbel)
+        return chosen_action(branches.logits, place, gumbel * curious[:, None])
 
     @torch.no_grad()
     def act(self, observation: Tensor) -> Tensor:
@@ -237,9 +246,11 @@ class HybridSac(Algorithm):
         shape = (len(batch), self.rules.cell.num_arms, self.config.modes, 2)
         critic_loss = self._critic_loss(present, following, self._noise(shape))
         self._step(self.critic_optimizer, critic_loss)
-        candidates = self._anywhere((*shape[:2], self.config.candidates, 2))
+        candidates = self._anywhere((int(shape[0] * self.config.candidate_share), shape[1], self.config.candidates, 2))
+        self.loss.critic.requires_grad_(False)
         actor_loss, branch_entropy, place_entropy = self._actor_loss(present, self._noise(shape), candidates)
         self._step(self.actor_optimizer, actor_loss)
+        self.loss.critic.requires_grad_(True)
         self._step(self.temperature_optimizer, self.loss.temperature_loss(branch_entropy, place_entropy, self.targets))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.loss.target.parameters()), list(self.loss.critic.parameters()), self.config.tau)

@@ -160,11 +160,11 @@ class AfterstateCritic(nn.Module):
     *follows* (the acting arm's block first), and the value of finishing off the acting arm's present block.
     """
 
-    def __init__(self, hidden: Sequence[int], canonical: bool, harmonics: int) -> None:
+    def __init__(self, place_hidden: Sequence[int], final_hidden: Sequence[int], canonical: bool, harmonics: int) -> None:
         super().__init__()
         self.mirror, self.harmonics = Mirror(canonical), Harmonics(harmonics)
-        self.place = TwinMLP(2 * self.harmonics.width, hidden)
-        self.final = TwinMLP(self.harmonics.width, hidden)
+        self.place = TwinMLP(2 * self.harmonics.width, place_hidden)
+        self.final = TwinMLP(self.harmonics.width, final_hidden)
 
     def value_place(self, following: Tensor) -> Tensor:
         """Values (2, ...) of afterstates (..., 2, fields): the acting arm's block, then the other's."""

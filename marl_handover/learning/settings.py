@@ -75,12 +75,15 @@ class SacConfig(OffPolicyConfig):
     name: str = "sac"
     actor_hidden: list[int] = field(default_factory=lambda: [128, 128])
     critic_hidden: list[int] = field(default_factory=lambda: [128, 128])
+    final_hidden: list[int] = field(default_factory=lambda: [64, 64])  # of the critic of finishing
     modes: int = 1  # place distributions an arm, chosen between like the other discrete branches
     canonical: bool = True  # fold the mirror symmetry M_x into the networks
     harmonics: int = 2  # doublings of the angles that the networks see
-    candidates: int = 8  # random places an arm, to whose best the actor's mean is drawn where the critic prefers it
+    candidates: int = 4  # random places an arm; the actor's mean is drawn to the nearest that the critic clearly prefers
+    candidate_share: float = 0.5  # of the batch
     candidate_weight: float = 1.0
-    candidate_margin: float = 0.1  # in units of scaled reward
+    candidate_margin: float = 0.25  # in units of scaled reward
+    greedy_share: float = 0.25  # of the cells, which act without noise
     random_place: float = 0.1  # share of exploration's places that are drawn anywhere
     place_entropy_start: float = -2.0  # target entropies fall from start (linearly / geometrically) ...
     place_entropy_end: float = -5.0

@@ -42,11 +42,11 @@ def learning_figure(runs: Mapping[str, Metrics]) -> Figure:
 
 
 def stage_changes(run: Metrics) -> list[float]:
-    """Environment steps of the rows at which the range of epsilon is no longer that of the row before."""
+    """Environment steps at which the range of epsilon changed. A row tells the range up to it, so that is the last row with the old one."""
     low, high = run["epsilon_low_deg"], run["epsilon_high_deg"]
     changed = (np.diff(low) != 0) | (np.diff(high) != 0)
     known = np.isfinite(low) & np.isfinite(high)
-    return [float(step) for step in run["step"][1:][changed & known[1:] & known[:-1]]]
+    return [float(step) for step in run["step"][:-1][changed & known[1:] & known[:-1]]]
 
 
 def _title(names: list[str]) -> str:
@@ -59,7 +59,7 @@ def _title(names: list[str]) -> str:
 def _curve(axes: Axes, runs: list[Metrics], column: str, colour: str) -> None:
     steps, values = common_curve(runs, column)
     if not len(values):
-        axes.text(0.5, 0.5, "no values yet", transform=axes.transAxes, ha="center", va="center", color=GREY)
+        axes.text(0.5, 0.75, "no values yet", transform=axes.transAxes, ha="center", va="center", color=GREY)
         axes.set_yticks([])
         return
     if len(values) > 1:

@@ -45,6 +45,18 @@ class Verdict(NamedTuple):
     outcome: Array
 
 
+class Finishing(NamedTuple):
+    """Each arm's final transfer, if it were done now; all (..., num_arms).
+
+    ``able``: it reaches object and goal and leaves at most epsilon; ``error_rad``: the orientation error left; ``turn_rad``:
+    the turn of the object.
+    """
+
+    able: Array
+    error_rad: Array
+    turn_rad: Array
+
+
 class Transition(NamedTuple):
     """Result of one decision.
 
@@ -91,16 +103,22 @@ class Rules:
         k = self.config.symmetry_order
         return wrap((theta_rad - goal_theta_rad) * k) / k
 
+    def finishing(self, pose: Array, goal: Array, epsilon_rad: Array | float | None = None) -> Finishing:
+        """What each arm would do to the object by taking it to the goal now."""
+        square, yaw = self.cell.polar(pose)
+        goal_square, goal_yaw = self.cell.polar(goal)
+        turn = goal_yaw - yaw
+        error = self.orientation_error(pose[..., 2:3] + turn, goal[..., 2:3])
+        reach = self.cell.within(square, yaw) & self.cell.within(goal_square, goal_yaw)
+        return Finishing(reach & (abs(error) <= self._epsilon(epsilon_rad)), error, turn)
+
     def finishing_error(self, pose: Array, goal: Array) -> Array:
         """Orientation error each arm would leave if it took the object to the goal now: rad, (..., num_arms). Ignores reach."""
-        yaw, goal_yaw = self.cell.polar(pose)[1], self.cell.polar(goal)[1]
-        return self.orientation_error(pose[..., 2:3] + goal_yaw - yaw, goal[..., 2:3])
+        return self.finishing(pose, goal).error_rad
 
     def can_finish(self, pose: Array, goal: Array, epsilon_rad: Array | float | None = None) -> Array:
         """Which arms can put the object at the goal within epsilon: bool (..., num_arms)."""
-        epsilon = self._epsilon(epsilon_rad)
-        reach = self.cell.reaches(pose) & self.cell.reaches(goal)
-        return reach & (abs(self.finishing_error(pose, goal)) <= epsilon)
+        return self.finishing(pose, goal, epsilon_rad).able
 
     def decode(self, action: Array) -> Command:
         """Command of an action (..., 4): final, arm, alpha, beta, each in [-1, 1]; a positive first or second number means final / R."""
@@ -214,21 +232,21 @@ class Rules:
         placed = one_where(early, pose, placed)
         feasible = feasible | early
         room = True if transfers_left is None else (early | (transfers_left > 1))
-        verdict = self.judge(placed, goal, command.final, feasible, epsilon_rad)
-        solved = verdict.terminated & room
-        able = self.can_finish(placed, goal, epsilon_rad)
-        error = abs(self.finishing_error(placed, goal))
+        finishing = self.finishing(placed, goal, epsilon_rad)
+        solved = finishing.able.any(-1) & room
         # The arm that leaves the smaller error: a rule that favours neither side keeps the mirror law.
-        nearest = xp.argmin(xp.where(able, error, error + 2 * math.pi), -1)
+        error = abs(finishing.error_rad)
+        nearest = xp.argmin(xp.where(finishing.able, error, error + 2 * math.pi), -1)
         external_arm = xp.where(solved, nearest, -1)
-        finish = Command(solved, xp.where(solved, external_arm, command.arm), placed[..., :2])
-        final_pose, _ = self.transfer(placed, goal, finish)
+        final_theta = wrap(placed[..., 2] + select(finishing.turn_rad, nearest))
+        final_pose = xp.concat([goal[..., :2], final_theta[..., None]], -1)
         if noise is not None:
             final_pose = self._displaced(final_pose, one_where(solved, noise, 0 * noise))
         after = xp.where(solved, external_arm, xp.where(feasible, command.arm, previous_arm))
         transfers = xp.where(early, 0, 1) + xp.where(solved, 1, 0)
-        outcome = xp.where(solved, verdict.outcome, int(Outcome.NONE))
-        reward = xp.where(solved, verdict.reward, -xp.ones_like(verdict.reward)) - self.motion_penalty(command.arm, pose, placed)
+        outcome = xp.where(solved, int(Outcome.SUCCESS), int(Outcome.NONE))
+        one = xp.ones_like(placed[..., 0])
+        reward = xp.where(solved, 0 * one, -one) - self.motion_penalty(command.arm, pose, placed)
         pose = one_where(solved, final_pose, placed)
         return Transition(pose, after, placed, command, feasible, external_arm, transfers, reward, solved, outcome)
 

@@ -62,7 +62,7 @@ def test_json_and_picture(tmp_path):
     plan = json.loads(json_file.read_text())
     assert plan["policy"] == "exact"
     assert (plan["architecture"], plan["epsilon_deg"], plan["symmetry_order"]) == ("A", 1, 2)
-    assert plan["start"] == pytest.approx([-100, -80, math.radians(20)])
+    assert plan["start"] == pytest.approx([-120, -70, math.radians(20)])
     assert plan["cell_settings"]["chart_inset"] == 0.9
     assert {"arm", "final", "from", "to", "alpha", "beta", "path_mm"} <= set(plan["transfers"][0])
     assert colours(picture) > 20

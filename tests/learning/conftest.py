@@ -25,7 +25,7 @@ SMALL_NETWORKS = {
     "sac": ("actor_hidden=[32,32]", "critic_hidden=[32,32]", "learning_starts=200", "batch_size=32", "steps_per_update=16"),
     "box_sac": ("hidden=[32,32]", "learning_starts=200", "batch_size=32", "steps_per_update=16"),
     "td3": ("hidden=[32,32]", "learning_starts=200", "batch_size=32", "steps_per_update=16"),
-    "ppo": ("hidden=[32,32]", "rollout_steps=20", "batch_size=160", "epochs=2"),
+    "ppo": ("hidden=[32,32]", "rollout_steps=16", "batch_size=160", "epochs=2"),
 }
 
 

@@ -34,7 +34,7 @@ def step_of_all_cells(time, done):
 
 
 @given(st.lists(st.lists(st.booleans(), min_size=3, max_size=3), min_size=1, max_size=25))
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_writer_hands_over_whole_contiguous_episodes(pattern):
     limit, cells = 6, 3
     writer = EpisodeWriter(cells, limit, torch.device("cpu"))
@@ -95,7 +95,7 @@ def assert_goals_of_own_episode(batch, strategy, last_step):
 
 @pytest.mark.parametrize("strategy", ["future", "final", "episode"])
 @given(lengths=st.lists(st.integers(1, 8), min_size=1, max_size=12), seed=st.integers(0, 10_000))
-@settings(max_examples=25)
+@settings(max_examples=10)
 def test_goals_never_leak_across_episodes(paper, rules_of, made_up_episodes, strategy, lengths, seed):
     replay = memory(paper, rules_of, 200, seed, strategy=strategy)
     replay.extend(made_up_episodes(lengths))
@@ -106,7 +106,7 @@ def test_goals_never_leak_across_episodes(paper, rules_of, made_up_episodes, str
 
 @pytest.mark.parametrize("strategy", ["future", "final", "episode"])
 @given(lengths=st.lists(st.integers(1, 8), min_size=8, max_size=40), seed=st.integers(0, 10_000))
-@settings(max_examples=25)
+@settings(max_examples=10)
 def test_a_full_ring_never_reads_an_overwritten_episode(paper, rules_of, made_up_episodes, strategy, lengths, seed):
     capacity = 24
     replay = memory(paper, rules_of, capacity, seed, strategy=strategy)

@@ -61,5 +61,5 @@ def test_seeds_meet_over_their_common_steps(tmp_path):
     np.testing.assert_array_equal(steps, [5, 10, 15])
     np.testing.assert_allclose(values, [[0.5, 1, 1], [0, 0.5, 1]])
     assert common_curve([second], "steps_ratio")[1].size == 0
-    assert stage_changes(first) == [20]
+    assert stage_changes(first) == [10]
     assert stage_changes(second) == []

@@ -106,13 +106,17 @@ def test_relative_fields_say_what_their_names_say(cell, rules_of, draw):
     np.testing.assert_array_equal(field(vector, "other_reaches_goal"), cell.reaches(goal)[:, ::-1])
     np.testing.assert_array_equal(field(vector, "was_previous"), previous[:, None] == [0, 1])
     np.testing.assert_array_equal(field(vector, "other_was_previous"), previous[:, None] == [1, 0])
-    np.testing.assert_allclose(field(vector, "cos_finish_error"), np.cos(rules.finishing_error(pose, goal)), atol=1e-12)
     own = np.array([-1.0, 1.0])  # the left arm sees the mirror image
-    error = rules.finishing_error(pose, goal)
-    in_epsilons = {name: np.clip(own * e / math.radians(40), -3, 3) / 3 for name, e in (("", error), ("other_", error[:, ::-1]))}
-    for name, expected in in_epsilons.items():
-        np.testing.assert_allclose(field(vector, f"{name}finish_error_in_epsilons"), expected, atol=1e-12)
-    np.testing.assert_allclose(field(vector, "sin_finish_error"), own * np.sin(error), atol=1e-12)
+    error, matters = rules.finishing_error(pose, goal), cell.reaches(goal)  # without reach an arm's error has no bearing
+    for name, e, gate in (("", error, matters), ("other_", error[:, ::-1], matters[:, ::-1])):
+        in_epsilons = e / math.radians(40)
+        np.testing.assert_allclose(
+            field(vector, f"{name}finish_error_in_epsilons"), gate * np.clip(own * in_epsilons, -3, 3) / 3, atol=1e-12
+        )
+        margin = np.where(gate, np.clip(2 * (1 - np.abs(in_epsilons)), -1, 1), -1)
+        np.testing.assert_allclose(field(vector, f"{name}finish_margin"), margin, atol=1e-12)
+    np.testing.assert_allclose(field(vector, "cos_finish_error"), matters * np.cos(error), atol=1e-12)
+    np.testing.assert_allclose(field(vector, "sin_finish_error"), matters * own * np.sin(error), atol=1e-12)
     for name, place in (("", pose), ("goal_", goal)):
         np.testing.assert_allclose(field(vector, f"{name}x"), place[:, :1] * [1, 1] / cell.r_max_mm)
         np.testing.assert_allclose(field(vector, f"{name}y"), place[:, 1:2] * own / cell.r_max_mm)
@@ -135,7 +139,7 @@ def test_hand_over_field_names_the_place_where_the_other_arm_can_finish(cell, ru
     angle = psi[rows, arm] - psi[rows, 1 - arm]
     left = rules.orientation_error(angle, needed)
     error = rules.finishing_error(result.placed, goal)[rows, 1 - arm]
-    done = result.feasible
+    done = result.feasible & cell.reaches(goal)[rows, 1 - arm]
     assert done.sum() > 1000
     np.testing.assert_allclose(np.cos(error[done] - left[done]), 1, atol=1e-9)
 
