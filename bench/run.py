@@ -68,7 +68,11 @@ def run_ours(folder: Path, values: Mapping[str, Any]) -> Result:
     run, arguments = folder / "train", [f"seed={values['seed']}", "threads=1"]
     shutil.rmtree(run, ignore_errors=True)
     status = call("-m", "marl_handover.cli", "train", *arguments, f"out={run}")
-    rows = [{**row, "steps": row["step"], "gradient_steps": row["gradient_step"]} for row in read_metrics(run / "metrics.csv") if "success_rate" in row and "step" in row]
+    rows = [
+        {**row, "steps": row["step"], "gradient_steps": row["gradient_step"]}
+        for row in read_metrics(run / "metrics.csv")
+        if "success_rate" in row and "step" in row
+    ]
     if status or not rows:
         return {"variant": "ours", "failed": f"exit status {status}, {len(rows)} evaluations"}
     result = {

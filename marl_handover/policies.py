@@ -13,6 +13,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from marl_handover.arrays import select
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import CellConfig, NoiseConfig, RewardConfig, TaskConfig
-from marl_handover.errors import CorruptFile, MissingFile, UnknownChoice
+from marl_handover.errors import CheckpointMismatch, CorruptFile, MissingFile, UnknownChoice
 from marl_handover.resources import package_path
 from marl_handover.task.observations import ARM_FIELDS, ODD_FIELDS, observe
 from marl_handover.task.planner import ExactPlanner
@@ -204,6 +205,29 @@ def load(name: str, cell: Cell | None = None, task: TaskConfig | None = None, se
     about = json.loads(str(arrays["about"]))
     own_cell, own_task = stored_settings(about)
     return NetworkPolicy(Rules(cell or load_cell(own_cell), task or own_task), name, arrays, about)
+
+
+def adapted(name: str, cell: CellConfig | None = None, task: TaskConfig | None = None, seed: int = 0, **changes: Any) -> SupervisorPolicy:
+    """A policy by name under its own cell and task, except where the caller says otherwise.
+
+    Args:
+        name: as in :func:`load`.
+        cell: settings of another cell.
+        task: settings of another task; a trained policy keeps its architecture.
+        seed: of ``random``.
+        changes: single task settings put over that; None leaves one as it is.
+
+    Raises:
+        CheckpointMismatch: ``architecture`` is asked for and the policy was trained for the other one.
+    """
+    own = load(name, seed=seed)
+    trained = own.rules.config.architecture if isinstance(own, NetworkPolicy) else None
+    settings = replace(task, architecture=trained or task.architecture) if task else own.rules.config
+    settings = replace(settings, **{key: value for key, value in changes.items() if value is not None})
+    settings.validate()
+    if trained and settings.architecture != trained:
+        raise CheckpointMismatch(name, "architecture", trained, settings.architecture)
+    return own.under(Rules(own.rules.cell if cell is None else load_cell(cell), settings))
 
 
 def stored_settings(about: Mapping[str, Any]) -> tuple[CellConfig, TaskConfig]:

@@ -11,13 +11,11 @@ import numpy as np
 from tqdm import tqdm
 
 from marl_handover import policies
-from marl_handover.cell import load_cell
-from marl_handover.config import CellConfig, TaskConfig, require_at_least, require_choice, require_positive
-from marl_handover.errors import CheckpointMismatch, MissingFile
+from marl_handover.config import CellConfig, TaskConfig, require_at_least, require_choice
+from marl_handover.errors import MissingFile
 from marl_handover.learning.evaluation import Evaluation, evaluate, random_problems, read_problems
 from marl_handover.learning.recorder import write_whole
 from marl_handover.learning.trace import Trace
-from marl_handover.policies import NetworkPolicy, SupervisorPolicy
 from marl_handover.task.rules import Outcome
 
 BACKENDS = ("kinematic",)
@@ -33,8 +31,8 @@ class EvaluateCommand:
     seed: int = 0  # of the problems and of execution noise
     epsilon_deg: float | None = None  # allowed orientation error
     architecture: str | None = None  # A or B
-    cell: CellConfig | None = None
-    task: TaskConfig | None = None
+    cell: CellConfig | None = None  # single keys change the paper cell
+    task: TaskConfig | None = None  # single keys change the default task; a trained policy keeps its architecture
     problems: str = ""  # JSON Lines of problems instead of random ones
     json: str = ""  # file for the result
     trace: str = ""  # file for every transfer
@@ -54,7 +52,8 @@ def run(config: EvaluateCommand) -> int:
     for path in (config.json, config.trace):
         if path and not Path(path).parent.is_dir():
             raise MissingFile("folder", Path(path).parent, "make it first")
-    policy = load_policy(config.policy, config.cell, config.task, config.epsilon_deg, config.architecture, config.seed)
+    changes = {"epsilon_deg": config.epsilon_deg, "architecture": config.architecture}
+    policy = policies.adapted(config.policy, config.cell, config.task, config.seed, **changes)
     rules = policy.rules
     problems = read_problems(rules, Path(config.problems)) if config.problems else random_problems(rules, config.episodes, config.seed)
     trace = Trace(rules) if config.trace else None
@@ -66,6 +65,7 @@ def run(config: EvaluateCommand) -> int:
         "variant": policy.variant,
         "backend": config.backend,
         "epsilon_deg": rules.config.epsilon_deg,
+        "symmetry_order": rules.config.symmetry_order,
         "seed": config.seed,
         **result.report(),
     }
@@ -75,35 +75,6 @@ def run(config: EvaluateCommand) -> int:
     if trace is not None:
         write_whole(Path(config.trace), trace.text())
     return 0
-
-
-def load_policy(
-    name: str,
-    cell: CellConfig | None,
-    task: TaskConfig | None,
-    epsilon_deg: float | None,
-    architecture: str | None,
-    seed: int = 0,
-) -> SupervisorPolicy:
-    """A policy with the given settings put over its own.
-
-    Raises:
-        CheckpointMismatch: a trained policy of another architecture than the one asked for.
-    """
-    policy = policies.load(name, None if cell is None else load_cell(cell), task, seed)
-    trained = isinstance(policy, NetworkPolicy)
-    settings = policy.rules.config
-    if isinstance(policy, NetworkPolicy):
-        own = policies.stored_settings(policy.about)[1].architecture
-        wanted = architecture or (task.architecture if task else own)
-        if wanted != own:
-            raise CheckpointMismatch(name, "architecture", own, wanted)
-    if epsilon_deg is not None:
-        require_positive("epsilon_deg", epsilon_deg)
-        settings.epsilon_deg = epsilon_deg
-    if architecture is not None and not trained:
-        settings.architecture = architecture
-    return policy.under(type(policy.rules)(policy.rules.cell, settings))
 
 
 def table(report: dict[str, Any], result: Evaluation) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.arrays import wrap
-from marl_handover.cell import NO_ARM, load_cell
+from marl_handover.cell import NO_ARM
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.config import CellConfig
-from marl_handover.errors import CheckpointMismatch, InvalidSetting, NotFinite, OutOfReach, WorkFailed
-from marl_handover.policies import SupervisorPolicy, load
+from marl_handover.config import CellConfig, NoiseConfig
+from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, WorkFailed
+from marl_handover.policies import SupervisorPolicy, adapted
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Outcome, Rules
 
@@ -135,17 +135,9 @@ def _pose(name: str, values: list[float]) -> Floats:
 
 def _policy(config: PlanConfig) -> SupervisorPolicy:
     """The policy under its own cell and task, except where ``config`` says otherwise."""
-    own = load(config.policy, seed=config.seed)
     named = {key: getattr(config, key) for key in ("architecture", "epsilon_deg", "symmetry_order")}
-    changes = {key: value for key, value in named.items() if value is not None}
     # The rules are exact here: noise that a policy was trained with would only widen what counts as "at the goal".
-    task = replace(own.rules.config, **changes, noise=type(own.rules.config.noise)())
-    task.validate()
-    about: dict[str, Any] = getattr(own, "about", {})
-    if about and own.rules.external_finish and task.architecture == "B":
-        raise CheckpointMismatch(config.policy, "architecture", "A", "B")  # it never learned to say "final"
-    cell = own.rules.cell if config.cell is None else load_cell(config.cell)
-    return load(config.policy, cell, task, config.seed)
+    return adapted(config.policy, config.cell, seed=config.seed, **named, noise=NoiseConfig())
 
 
 def counted(count: int) -> str:

@@ -103,7 +103,7 @@ class HybridSacLoss(LossModule):
         value = torch.where(batch["final"], self.critic.value_final(own), self.critic.value_place(after))
         return (value - target).square().mean(1).sum()
 
-    def actor_loss(self, batch: dict[str, Tensor], noise: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def actor_loss(self, batch: dict[str, Tensor], noise: Tensor, candidates: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Loss of the actor, then the mean branch entropy and the mean place entropy, for the temperatures."""
         soft = self.soft_value(self.critic, batch, noise)
         weight = soft.probability[..., 1:].detach()
@@ -111,27 +111,31 @@ class HybridSacLoss(LossModule):
         loss = -soft.value.mean()
         if candidates.numel():
             some = {key: value[: len(candidates)] for key, value in batch.items()}
-            loss = loss + self.config.candidate_weight * self._candidate_loss(some, candidates)
+            loss = loss + self.config.candidate_weight * self._candidate_loss(some, candidates, offsets)
         return loss, soft.branch_entropy.mean().detach(), place_entropy.detach()
 
-    def _candidate_loss(self, batch: dict[str, Tensor], candidates: Tensor) -> Tensor:
-        """Squared distance of each arm's best mode to the *nearest* of the ``candidates`` (n, arms, m, 2) that beat it by the margin.
+    def _candidate_loss(self, batch: dict[str, Tensor], candidates: Tensor, offsets: Tensor) -> Tensor:
+        """Squared distance of each arm's best mode to the *nearest* of some places that beat it by the margin.
 
         The nearest, not the best: between two equally good regions, drawing towards now one, now the other would leave the
-        mean in the bad middle.
+        mean in the bad middle. The places are ``candidates`` (n, arms, m, 2) and the mean itself moved by ``offsets`` (n, arms, k, 2).
         """
         mean = self.actor(batch["observation"]).mean.tanh()
         modes = mean.shape[2]
         with torch.no_grad():
-            places = torch.cat([mean, candidates], 2)
-            value = self.critic.value_place(self.afterstates(batch["pose"], batch["goal"], places, batch["epsilon"])).amin(0)
-            mode_value, mode = value[..., :modes].max(-1)
-        chosen = mean.gather(2, mode[..., None, None].expand(-1, -1, 1, 2))
-        gain = value[..., modes:] - mode_value[..., None] - self.config.candidate_margin
-        distance = (chosen - candidates).square().sum(-1)
+            mode_value, mode = self._place_value(batch, mean).max(-1)
+        chosen = mean.gather(2, mode[..., None, None].expand(-1, -1, 1, 2)) if modes > 1 else mean
+        with torch.no_grad():
+            places = torch.cat([candidates, (chosen + offsets).clamp(-1.0, 1.0)], 2)
+            gain = self._place_value(batch, places) - mode_value[..., None] - self.config.candidate_margin
+        distance = (chosen - places).square().sum(-1)
         nearest = torch.where(gain > 0, distance.detach(), torch.inf).argmin(-1, keepdim=True)
         weight = gain.gather(-1, nearest).clamp(0.0, 1.0)
         return (weight * distance.gather(-1, nearest)).sum((-2, -1)).mean()
+
+    def _place_value(self, batch: dict[str, Tensor], places: Tensor) -> Tensor:
+        """The lower of both critics' values (n, arms, m) of places (n, arms, m, 2)."""
+        return self.critic.value_place(self.afterstates(batch["pose"], batch["goal"], places, batch["epsilon"])).amin(0)
 
     def temperature_loss(self, branch_entropy: Tensor, place_entropy: Tensor, targets: tuple[float, float]) -> Tensor:
         """Raises a temperature whose entropy (of places, of branches) is below its target."""
@@ -143,9 +147,9 @@ class HybridSacLoss(LossModule):
         batch, following = unpacked(tensordict)
         shape = (len(tensordict), self.rules.cell.num_arms, self.actor.modes, 2)
         noise = torch.randn(2, *shape, device=tensordict.device)
-        candidates = torch.zeros(0, shape[1], 0, 2, device=tensordict.device)
+        none = torch.zeros(0, shape[1], 0, 2, device=tensordict.device)
         critic = self.critic_loss(batch, following, noise[0])
-        actor, branch, place = self.actor_loss(batch, noise[1], candidates)
+        actor, branch, place = self.actor_loss(batch, noise[1], none, none)
         return TensorDict({"loss_qvalue": critic, "loss_actor": actor, "entropy_branch": branch, "entropy_place": place})
 
 
@@ -246,9 +250,11 @@ class HybridSac(Algorithm):
         shape = (len(batch), self.rules.cell.num_arms, self.config.modes, 2)
         critic_loss = self._critic_loss(present, following, self._noise(shape))
         self._step(self.critic_optimizer, critic_loss)
-        candidates = self._anywhere((int(shape[0] * self.config.candidate_share), shape[1], self.config.candidates, 2))
+        tried = (int(shape[0] * self.config.candidate_share), shape[1], self.config.candidates, 2)
         self.loss.critic.requires_grad_(False)
-        actor_loss, branch_entropy, place_entropy = self._actor_loss(present, self._noise(shape), candidates)
+        actor_loss, branch_entropy, place_entropy = self._actor_loss(
+            present, self._noise(shape), self._anywhere(tried), self._nearby(tried)
+        )
         self._step(self.actor_optimizer, actor_loss)
         self.loss.critic.requires_grad_(True)
         self._step(self.temperature_optimizer, self.loss.temperature_loss(branch_entropy, place_entropy, self.targets))
@@ -273,6 +279,11 @@ class HybridSac(Algorithm):
         """Chart coordinates spread evenly, with a share exactly on the edge, where the largest turns are made."""
         uniform = torch.rand(shape, generator=self.generator, device=self.device) * 2 - 1
         return (uniform * EDGE).clamp(-1.0, 1.0)
+
+    def _nearby(self, shape: tuple[int, ...]) -> Tensor:
+        """Offsets in the chart, of sizes from a hundredth to a third."""
+        size = 10 ** -(0.5 + 1.5 * torch.rand(*shape[:-1], 1, generator=self.generator, device=self.device))
+        return size * self._noise(shape)
 
     def _noise(self, shape: tuple[int, ...]) -> Tensor:
         return torch.randn(shape, generator=self.generator, device=self.device)

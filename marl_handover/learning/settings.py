@@ -79,7 +79,7 @@ class SacConfig(OffPolicyConfig):
     modes: int = 1  # place distributions an arm, chosen between like the other discrete branches
     canonical: bool = True  # fold the mirror symmetry M_x into the networks
     harmonics: int = 2  # doublings of the angles that the networks see
-    candidates: int = 4  # random places an arm; the actor's mean is drawn to the nearest that the critic clearly prefers
+    candidates: int = 3  # places an arm tried anywhere, and as many nearby; the actor's mean is drawn to the nearest clearly better one
     candidate_share: float = 0.5  # of the batch
     candidate_weight: float = 1.0
     candidate_margin: float = 0.25  # in units of scaled reward

@@ -220,6 +220,7 @@ class Trainer:
                 "current": None if self.current is None else self.current.to_dict(),
                 "recent": self.recent,
                 "last": self.last,
+                "losses": self.losses,
                 "random": {
                     "learner": self.generator.get_state(),
                     "problems": self.env.generator.get_state(),
@@ -245,7 +246,7 @@ class Trainer:
         self.curriculum.enter(self.counters.stage)
         if state["current"] is not None:
             self.current = TensorDict(state["current"], self.env.batch_size, device=self.device)
-        self.recent, self.last = state["recent"], state["last"]
+        self.recent, self.last, self.losses = state["recent"], state["last"], state["losses"]
         self.generator.set_state(state["random"]["learner"].cpu())
         self.env.generator.set_state(state["random"]["problems"].cpu())
         torch.set_rng_state(state["random"]["torch"].cpu())

@@ -118,7 +118,7 @@ def test_trace_is_what_the_rules_say(tmp_path, policy, architecture, assert_same
             if architecture == "B":
                 assert line["reward"] == float(truth.reward)
             else:
-                solved = last and line["terminated"] or (not last and episode[index + 1]["final"])
+                solved = (last and line["terminated"]) or (not last and episode[index + 1]["final"])
                 assert line["reward"] == (0.0 if solved else -1.0)
                 assert line["final"] == (last and line["terminated"])
             if not last:

@@ -118,7 +118,7 @@ def test_a_run_is_not_overwritten(finished, capsys):
         ("algorithm.modes=0", ("algorithm.modes",)),
         ("algorithm.layout=raw", ("algorithm.layout", "relative")),
         ("resume=nowhere", ("nowhere",)),
-        ("seed=-1", ("seed",)),
+        ("seed=100000000000000000000", ("seed",)),
     ],
 )
 def test_bad_input_is_one_line_and_exit_2(capsys, tmp_path, argument, words):

@@ -158,7 +158,7 @@ def test_value_is_the_mean_over_sampled_branches(learner, batch, replay):
 
 
 def test_exploration_draws_the_branches_by_their_probability(learner, batch):
-    learner.config.random_place = 0.0
+    learner.config.random_place = learner.config.greedy_share = 0.0
     observation = batch["observation"][:1].expand(20_000, -1)
     action = learner.explore(observation)
     probability = learner.loss.actor(observation[:1]).logits.flatten().softmax(-1).view(2, -1)
