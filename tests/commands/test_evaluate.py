@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 
+from marl_handover import policies
 from marl_handover.cell import load_cell
 from marl_handover.cli import main
-from marl_handover.commands.evaluate import load_policy
 from marl_handover.compose import compose
 from marl_handover.config import TaskConfig
 from marl_handover.learning import evaluation
@@ -157,7 +157,7 @@ def test_other_seeds_are_other_problems(tmp_path):
 
 @pytest.mark.parametrize("chunk", [7, 100])
 def test_chunks_do_not_change_results(monkeypatch, chunk):
-    policy = load_policy("greedy", None, None, None, "B")
+    policy = policies.adapted("greedy", architecture="B")
     problems = evaluation.random_problems(policy.rules, 1100, 0)
     seen = {}
     for size in (1000, chunk):

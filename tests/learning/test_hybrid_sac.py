@@ -114,12 +114,12 @@ def test_terminated_target_is_the_scaled_reward(learner, batch):
 def test_candidates_draw_the_mean_only_where_they_are_better(learner, batch):
     present, _ = unpacked(batch)
     mean = learner.loss.actor(present["observation"]).mean.tanh().detach()
-    anywhere = torch.rand(len(batch), 2, 8, 2) * 2 - 1
-    assert learner.loss._candidate_loss(present, mean) == 0  # no better than what is there
+    anywhere, still = torch.rand(len(batch), 2, 8, 2) * 2 - 1, torch.zeros(len(batch), 2, 1, 2)
+    assert learner.loss._candidate_loss(present, mean, still) == 0  # no better than what is there
     learner.config.candidate_margin = 1e6
-    assert learner.loss._candidate_loss(present, anywhere) == 0  # not better by enough
+    assert learner.loss._candidate_loss(present, anywhere, still) == 0  # not better by enough
     learner.config.candidate_margin = 0.0
-    loss = learner.loss._candidate_loss(present, anywhere)
+    loss = learner.loss._candidate_loss(present, anywhere, still)
     loss.backward()
     assert loss > 0
     assert gradients(learner.loss.actor) > 0
