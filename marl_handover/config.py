@@ -116,6 +116,14 @@ def require_at_least(name: str, value: float, least: float) -> None:
         raise InvalidSetting(name, value, f"a finite number, at least {least:g}")
 
 
+MAX_SEED = 2**31 - 1
+
+
+def require_seed(seed: int) -> None:
+    """Raise :class:`InvalidSetting` unless ``seed`` is one that every generator takes."""
+    require_between("seed", seed, 0, MAX_SEED)
+
+
 def require_between(name: str, value: float, low: float, high: float) -> None:
     """Raise :class:`InvalidSetting` unless ``low <= value <= high``."""
     if not (math.isfinite(value) and low <= value <= high):

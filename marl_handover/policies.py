@@ -25,11 +25,12 @@ from marl_handover.cell import Cell, load_cell
 from marl_handover.config import CellConfig, NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.errors import CheckpointMismatch, CorruptFile, MissingFile, UnknownChoice
 from marl_handover.resources import package_path
-from marl_handover.task.observations import ARM_FIELDS, ODD_FIELDS, observe
+from marl_handover.task.observations import ARM_FIELDS, ODD_FIELDS, observation_size, observe
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Rules
 
 Floats = NDArray[np.float64]
+KINDS = ("hybrid", "box")
 NAMES = ("exact", "random", "greedy", "pretrained_a", "pretrained_b")
 
 
@@ -222,7 +223,9 @@ def adapted(name: str, cell: CellConfig | None = None, task: TaskConfig | None =
     """
     own = load(name, seed=seed)
     trained = own.rules.config.architecture if isinstance(own, NetworkPolicy) else None
-    settings = replace(task, architecture=trained or task.architecture) if task else own.rules.config
+    settings = task or own.rules.config
+    if trained and settings.architecture == TaskConfig().architecture:
+        settings = replace(settings, architecture=trained)
     settings = replace(settings, **{key: value for key, value in changes.items() if value is not None})
     settings.validate()
     if trained and settings.architecture != trained:
@@ -266,7 +269,12 @@ def read_policy(path: Path) -> dict[str, NDArray[Any]]:
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}
         about = json.loads(str(arrays["about"]))
-        [arrays[f"weight_{index}"] for index in range(about["layers"])]
+        for index in range(about["layers"]):
+            arrays[f"weight_{index}"], arrays[f"bias_{index}"]
+        if about["kind"] not in KINDS:
+            raise ValueError(f"its kind is {about['kind']!r}, not one of {', '.join(KINDS)}")
+        observation_size(about["layout"])
+        stored_settings(about)
     except Exception as error:  # numpy, zip and json raise many kinds
         raise CorruptFile("policy file", path, str(error).splitlines()[0] if str(error) else type(error).__name__) from error
     return arrays

@@ -11,8 +11,8 @@ import numpy as np
 from tqdm import tqdm
 
 from marl_handover import policies
-from marl_handover.config import CellConfig, TaskConfig, require_at_least, require_choice
-from marl_handover.errors import MissingFile
+from marl_handover.config import CellConfig, TaskConfig, require_at_least, require_choice, require_seed
+from marl_handover.errors import InvalidSetting, MissingFile
 from marl_handover.learning.evaluation import Evaluation, evaluate, random_problems, read_problems
 from marl_handover.learning.recorder import write_whole
 from marl_handover.learning.trace import Trace
@@ -48,10 +48,12 @@ def run(config: EvaluateCommand) -> int:
     """Play, print the table, write the files."""
     require_choice("backend", config.backend, BACKENDS)
     require_at_least("episodes", config.episodes, 1)
-    require_at_least("seed", config.seed, 0)
-    for path in (config.json, config.trace):
+    require_seed(config.seed)
+    for name, path in (("json", config.json), ("trace", config.trace)):
         if path and not Path(path).parent.is_dir():
             raise MissingFile("folder", Path(path).parent, "make it first")
+        if path and Path(path).is_dir():
+            raise InvalidSetting(name, path, "a file, not a folder")
     changes = {"epsilon_deg": config.epsilon_deg, "architecture": config.architecture}
     policy = policies.adapted(config.policy, config.cell, config.task, config.seed, **changes)
     rules = policy.rules
@@ -79,9 +81,7 @@ def run(config: EvaluateCommand) -> int:
 
 def table(report: dict[str, Any], result: Evaluation) -> str:
     """The result beside the optimum, for people."""
-    ratio = report["steps_ratio"]
     low, high = report["success_ci95"]
-    mean = report["mean_steps_success"]
     outcomes = "  ".join(f"{name} {count}" for name, count in report["outcomes"].items())
     lines = [
         f"{report['policy']}: architecture {report['architecture']}, backend {report['backend']}, "
@@ -90,9 +90,9 @@ def table(report: dict[str, Any], result: Evaluation) -> str:
         f"{'':22}{'policy':>12}{'optimum':>12}",
         f"{'success':22}{100 * report['success_rate']:>11.2f}%{100 * (result.optimal > 0).mean():>11.2f}%",
         f"{'  95 % interval':22}{100 * low:>11.2f}%{100 * high:>11.2f}%",
-        f"{'mean steps':22}{report['mean_steps']:>12.3f}{report['optimal_mean_steps']:>12.3f}",
-        f"{'mean steps, success':22}{mean:>12.3f}" if mean is not None else f"{'mean steps, success':22}{'none':>12}",
-        f"{'steps / optimum':22}{ratio:>12.4f}" if ratio is not None else f"{'steps / optimum':22}{'none':>12}",
+        f"{'mean steps':22}{report['mean_steps']:>12.3f}{_number(report['optimal_mean_steps'], 3)}",
+        f"{'mean steps, success':22}{_number(report['mean_steps_success'], 3)}",
+        f"{'steps / optimum':22}{_number(report['steps_ratio'], 4)}",
         "",
         f"{'optimal steps':22}{'episodes':>12}{'success':>12}{'mean steps':>12}",
     ]
@@ -102,3 +102,7 @@ def table(report: dict[str, Any], result: Evaluation) -> str:
         lines.append(f"{steps:<22}{rows.sum():>12}{100 * solved[rows].mean():>11.2f}%{result.episodes.transfers[rows].mean():>12.3f}")
     lines += ["", outcomes, f"one decision: p50 {report['decision_us']['p50']:.0f} us, p99 {report['decision_us']['p99']:.0f} us"]
     return "\n".join(lines)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return f"{'none' if value is None else f'{value:.{digits}f}':>12}"

@@ -25,6 +25,8 @@ def run(config: TrainConfig) -> int:
         trainer = resumed(Path(config.resume), config.progress)
     else:
         folder = Path(config.out or datetime.now().strftime("runs/%Y%m%d-%H%M%S"))
+        if folder.exists() and not folder.is_dir():
+            raise InvalidSetting("out", str(folder), "a folder; this is a file")
         if (folder / FILE).exists():
             raise InvalidSetting("out", str(folder), f"a folder without a run; continue that one with resume={folder}")
         config.out = str(folder)
@@ -43,6 +45,7 @@ def resumed(folder: Path, progress: bool = True) -> Trainer:
     """A trainer that stands where the run in ``folder`` was last saved, or at its start if it never was."""
     if folder.is_dir() and not (folder / FILE).exists() and (folder / "config.yaml").exists():
         config = train_config((folder / "config.yaml").read_text(encoding="utf-8"), folder / "config.yaml")
+        config.progress = progress
         return Trainer(config, folder)
     if not folder.is_dir():
         raise MissingFile("run directory", folder)

@@ -12,6 +12,7 @@ from marl_handover.errors import CheckpointMismatch, CorruptFile, MissingFile
 
 FILE = "checkpoint.pt"
 FORMAT = 1
+PARTS = ("config", "counters", "algorithm", "replay", "episodes", "rollout", "current", "recent", "last", "best", "losses", "random")
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
@@ -46,4 +47,7 @@ def load_checkpoint(folder: Path, device: str | torch.device = "cpu") -> dict[st
         raise CorruptFile("checkpoint", path, "it holds no marl_handover state")
     if state["format"] != FORMAT:
         raise CheckpointMismatch(path, "format", state["format"], FORMAT)
+    missing = [part for part in PARTS if part not in state]
+    if missing:
+        raise CorruptFile("checkpoint", path, f"it lacks {', '.join(missing)}")
     return state

@@ -46,13 +46,17 @@ def read_problems(rules: Rules, path: Path) -> tuple[Floats, Floats]:
     if not path.is_file():
         raise MissingFile("problems file", path)
     poses: dict[str, list[Floats]] = {"state": [], "goal": []}
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CorruptFile("problems file", path, str(error)) from error
+    for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip():
             continue
         try:
             row = json.loads(line)
             values = {key: np.array(row[key], float).reshape(3) for key in poses}
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise CorruptFile("problems file", path, f"line {number} is not {{'state': [3 numbers], 'goal': [3 numbers]}}") from error
         for key, value in values.items():
             what = f"{key} in line {number} of {path}"
@@ -73,7 +77,8 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
     share = successes / trials
     centre = (share + z * z / (2 * trials)) / (1 + z * z / trials)
     half = z / (1 + z * z / trials) * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
-    return max(0.0, centre - half), min(1.0, centre + half)
+    # At the ends the bound is the share itself; rounding must not put it on the wrong side.
+    return (0.0 if successes == 0 else centre - half), (1.0 if successes == trials else centre + half)
 
 
 @dataclass
@@ -98,7 +103,7 @@ class Evaluation:
             "success_ci95": [low, high],
             "mean_steps": float(steps.mean()),
             "mean_steps_success": float(steps[solved].mean()) if successes else None,
-            "optimal_mean_steps": float(self.optimal[self.optimal > 0].mean()),
+            "optimal_mean_steps": float(self.optimal[self.optimal > 0].mean()) if (self.optimal > 0).any() else None,
             "steps_ratio": float((steps[known] / self.optimal[known]).mean()) if known.any() else None,
             "outcomes": {kind.name.lower(): int((outcome == int(kind)).sum()) for kind in Outcome if kind is not Outcome.NONE},
             "decision_us": {"p50": self.decision_us[0], "p99": self.decision_us[1]},

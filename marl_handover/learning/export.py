@@ -59,7 +59,7 @@ def save_policy(path: Path, arrays: Arrays) -> None:
 
 
 def run_arrays(folder: Path) -> Arrays:
-    """The policy of a run directory's checkpoint.
+    """The policy of a run directory: of all that it evaluated, the one that did best on its validation problems.
 
     Raises:
         MissingFile, CorruptFile, CheckpointMismatch: see :func:`load_checkpoint`.
@@ -72,9 +72,13 @@ def run_arrays(folder: Path) -> Arrays:
         rules = Rules(load_cell(config.cell), config.task)
         algorithm = make_algorithm(rules, config, torch.Generator())
         algorithm.load_state_dict(state["algorithm"])
+        step = state["counters"]["step"]
+        if state["best"]:
+            algorithm.actor().load_state_dict(state["best"]["actor"])
+            step = state["best"]["step"]
     except (KeyError, RuntimeError, TypeError, ValueError) as error:
         raise CorruptFile("checkpoint", folder / FILE, f"its parts do not fit together ({str(error).splitlines()[0]})") from error
-    return policy_arrays(algorithm, config, f"{folder} at step {state['counters']['step']}")
+    return policy_arrays(algorithm, config, f"{folder} at step {step}")
 
 
 def train_config(text: str, path: Path) -> TrainConfig:

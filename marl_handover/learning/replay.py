@@ -110,6 +110,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
         own = batch["desired_goal"]
         self._relabel_hindsight(batch, index)
         self._relabel_random(batch, index)
+        self._keep_unsolved(batch, own)
         if self.config.symmetry:
             self._mirror(batch)
         reward, terminated = self._judge(batch)
@@ -141,6 +142,15 @@ class HindsightReplayBuffer(HERReplayBuffer):
             batch["final"] = batch["final"] | (chosen & own)
         batch["hindsight"] = chosen[:, None]
 
+    def _keep_unsolved(self, batch: TensorDictBase, own: Tensor) -> None:
+        """Architecture A: a goal that the object could be taken to before the action would have ended the episode there;
+        such get their own back.
+        """
+        if self.rules.external_finish:
+            solved = self.rules.can_finish(batch["achieved_goal"], batch["desired_goal"], batch["epsilon"][:, 0]).any(-1)
+            batch["desired_goal"] = one_where(solved, own, batch["desired_goal"])
+            batch["hindsight"] = batch["hindsight"] & ~solved[:, None]
+
     def _near_miss(self, goal: Tensor, epsilon: Tensor) -> Tensor:
         """Some goals turned a little. What was achieved then misses them, or just not: exact hindsight alone only ever shows
         an error of 0.
@@ -161,7 +171,8 @@ class HindsightReplayBuffer(HERReplayBuffer):
     def _relabel_random(self, batch: TensorDictBase, index: Tensor) -> None:
         """Goal := another row's goal, for hand-overs, which do not depend on the goal."""
         count = len(index)
-        chosen = self._chance(count, self.config.hindsight.random_ratio) & ~batch["hindsight"][:, 0] & ~batch["final"]
+        share = self.config.hindsight.random_ratio if self.config.hindsight.strategy != "none" else 0.0
+        chosen = self._chance(count, share) & ~batch["hindsight"][:, 0] & ~batch["final"]
         other = torch.randint(len(self), (count,), generator=self.draw, device=index.device)
         goals = self._storage.get(other)["desired_goal"]
         batch["desired_goal"] = one_where(chosen & batch["feasible"][:, 0], goals, batch["desired_goal"])

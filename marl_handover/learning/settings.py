@@ -12,6 +12,7 @@ from marl_handover.config import (
     require_between,
     require_choice,
     require_positive,
+    require_seed,
 )
 
 
@@ -58,6 +59,13 @@ class AlgorithmConfig:
     reward_scale: float = 0.5
     batch_size: int = 256
 
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` on a value out of its limits."""
+        for name in ("learning_rate", "gamma", "reward_scale", "batch_size"):
+            require_positive(f"algorithm.{name}", getattr(self, name))
+        for name in ("gamma", "decay_from"):
+            require_between(f"algorithm.{name}", getattr(self, name), 0, 1)
+
 
 @dataclass
 class OffPolicyConfig(AlgorithmConfig):
@@ -66,6 +74,13 @@ class OffPolicyConfig(AlgorithmConfig):
     learning_starts: int = 1000  # environment steps with uniform actions, before the first update
     steps_per_update: float = 8.0  # environment steps for each gradient step
     tau: float = 0.01  # target smoothing
+
+    def validate(self) -> None:
+        """As the base class, and the replay's pace."""
+        super().validate()
+        require_positive("algorithm.steps_per_update", self.steps_per_update)
+        require_at_least("algorithm.learning_starts", self.learning_starts, 0)
+        require_between("algorithm.tau", self.tau, 0, 1)
 
 
 @dataclass
@@ -92,6 +107,17 @@ class SacConfig(OffPolicyConfig):
     entropy_until: float = 0.75  # ... to end at this fraction of training
     temperature_rate: float = 3e-3
     initial_temperature: float = 0.1
+
+    def validate(self) -> None:
+        """As the base class, and what only this algorithm has."""
+        super().validate()
+        require_at_least("algorithm.modes", self.modes, 1)
+        for name in ("harmonics", "candidates", "candidate_weight"):
+            require_at_least(f"algorithm.{name}", getattr(self, name), 0)
+        for name in ("candidate_share", "greedy_share", "random_place"):
+            require_between(f"algorithm.{name}", getattr(self, name), 0, 1)
+        for name in ("branch_entropy_start", "branch_entropy_end", "entropy_until", "temperature_rate", "initial_temperature"):
+            require_positive(f"algorithm.{name}", getattr(self, name))
 
 
 @dataclass
@@ -176,5 +202,5 @@ class TrainConfig:
         for index, stage in enumerate(self.curriculum):
             require_positive(f"curriculum[{index}].epsilon_low_deg", stage.epsilon_low_deg)
             require_at_least(f"curriculum[{index}].epsilon_high_deg", stage.epsilon_high_deg, stage.epsilon_low_deg)
-        for name in ("learning_rate", "gamma", "reward_scale", "batch_size"):
-            require_positive(f"algorithm.{name}", getattr(self.algorithm, name))
+        require_seed(self.seed)
+        self.algorithm.validate()

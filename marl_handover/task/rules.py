@@ -61,7 +61,8 @@ class Transition(NamedTuple):
     """Result of one decision.
 
     ``placed`` is the pose after the commanded transfer; ``pose`` also includes the external final transfer of architecture A,
-    done by ``external_arm`` (-1 where there was none). ``transfers`` counts both. ``feasible`` is False where the arm refused.
+    done by ``external_arm`` (-1 where there was none). ``transfers`` counts both. ``feasible`` is False where the arm refused
+    or, in architecture A, where the command was ignored because the episode was solved at its start.
     """
 
     pose: Array
@@ -230,7 +231,7 @@ class Rules:
         xp = namespace(pose)
         early = self.can_finish(pose, goal, epsilon_rad).any(-1)  # solved at the start: the action is ignored
         placed = one_where(early, pose, placed)
-        feasible = feasible | early
+        feasible = feasible & ~early
         room = True if transfers_left is None else (early | (transfers_left > 1))
         finishing = self.finishing(placed, goal, epsilon_rad)
         solved = finishing.able.any(-1) & room

@@ -167,10 +167,11 @@ def test_another_format_and_another_architecture_do_not_match(small, started):
 
 
 def test_a_temporary_file_of_a_killed_process_is_harmless(started):
-    before = load_checkpoint(started)["config"]
+    state = load_checkpoint(started)
+    before = state["config"]
     (started / f"{FILE}.tmp").write_bytes(b"half a checkpo")
     assert load_checkpoint(started)["config"] == before
-    save_checkpoint(started, {"config": "new"})
+    save_checkpoint(started, {**state, "config": "new"})
     assert load_checkpoint(started)["config"] == "new"
     assert not (started / f"{FILE}.tmp").exists()
 
