@@ -12,13 +12,12 @@ import math
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from marl_handover.learning.algorithm import Algorithm, compiled
-from marl_handover.learning.networks import AfterstateCritic, Branches, HybridActor, arm_blocks
+from marl_handover.learning.networks import AfterstateCritic, HybridActor, arm_blocks, chosen_action, squashed_sample
 from marl_handover.learning.settings import SacConfig, TrainConfig
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Command, Rules
@@ -34,15 +33,6 @@ class SoftValue(NamedTuple):
     probability: Tensor  # (n, arms, 1 + modes)
     branch_entropy: Tensor  # (n,)
     place_log_prob: Tensor  # (n, arms, modes)
-
-
-def squashed_sample(branches: Branches, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Reparametrised places (n, arms, modes, 2) in (-1, 1) and their log-densities (n, arms, modes)."""
-    raw = branches.mean + branches.log_std.exp() * noise
-    log_prob = -0.5 * noise.square() - branches.log_std - 0.5 * math.log(2 * math.pi)
-    # log(1 - tanh(x)^2), stable at saturation
-    log_prob = log_prob - 2 * (math.log(2) - raw - F.softplus(-2 * raw))
-    return raw.tanh(), log_prob.sum(-1)
 
 
 class HybridSacLoss(LossModule):
@@ -287,17 +277,3 @@ class HybridSac(Algorithm):
 
     def _noise(self, shape: tuple[int, ...]) -> Tensor:
         return torch.randn(shape, generator=self.generator, device=self.device)
-
-
-def chosen_action(logits: Tensor, place: Tensor, noise: Tensor | None = None) -> Tensor:
-    """Actions (n, 4) of the branch with the largest logit, after adding ``noise`` to the flattened logits.
-
-    ``logits`` (n, arms, 1 + modes); ``place`` (n, arms, modes, 2).
-    """
-    flat = logits.flatten(1) if noise is None else logits.flatten(1) + noise
-    branch = flat.argmax(-1)
-    arm, choice = branch // logits.shape[-1], branch % logits.shape[-1]
-    rows = torch.arange(len(logits), device=logits.device)
-    where = place[rows, arm, (choice - 1).clamp_min(0)]
-    final = torch.where(choice == 0, 1.0, -1.0)
-    return torch.cat([torch.stack([final, 2.0 * arm - 1.0], -1), where], -1)

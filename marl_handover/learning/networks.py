@@ -109,6 +109,29 @@ class Branches(NamedTuple):
     log_std: Tensor
 
 
+def squashed_sample(branches: Branches, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Reparametrised places (n, arms, modes, 2) in (-1, 1) and their log-densities (n, arms, modes)."""
+    raw = branches.mean + branches.log_std.exp() * noise
+    log_prob = -0.5 * noise.square() - branches.log_std - 0.5 * math.log(2 * math.pi)
+    # log(1 - tanh(x)^2), stable at saturation
+    log_prob = log_prob - 2 * (math.log(2) - raw - F.softplus(-2 * raw))
+    return raw.tanh(), log_prob.sum(-1)
+
+
+def chosen_action(logits: Tensor, place: Tensor, noise: Tensor | None = None) -> Tensor:
+    """Actions (n, 4) of the branch with the largest logit, after adding ``noise`` to the flattened logits.
+
+    ``logits`` (n, arms, 1 + modes); ``place`` (n, arms, modes, 2).
+    """
+    flat = logits.flatten(1) if noise is None else logits.flatten(1) + noise
+    branch = flat.argmax(-1)
+    arm, choice = branch // logits.shape[-1], branch % logits.shape[-1]
+    rows = torch.arange(len(logits), device=logits.device)
+    where = place[rows, arm, (choice - 1).clamp_min(0)]
+    final = torch.where(choice == 0, 1.0, -1.0)
+    return torch.cat([torch.stack([final, 2.0 * arm - 1.0], -1), where], -1)
+
+
 def arm_blocks(observation: Tensor) -> Tensor:
     """The ``relative`` layout (..., num_arms * fields) as one block an arm (..., num_arms, fields)."""
     return observation.unflatten(-1, (-1, len(ARM_FIELDS)))
