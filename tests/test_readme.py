@@ -1,0 +1,50 @@
+"""The README's code runs as it stands, and its commands are ones that exist."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from marl_handover.cli import COMMANDS, main
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+TEXT = README.read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+COMMAND_LINES = re.findall(r"^marl-handover ([^#\n]+)", TEXT, re.MULTILINE)
+
+
+def test_readme_has_examples():
+    assert len(EXAMPLES) >= 2
+    assert len(COMMAND_LINES) >= 5
+
+
+@pytest.mark.parametrize("code", EXAMPLES)
+def test_examples_run(code, capsys):
+    exec(compile(code, str(README), "exec"), {"__name__": "readme"})
+    assert capsys.readouterr().out.strip()
+
+
+def test_the_pretrained_policy_of_the_example_succeeds(capsys):
+    exec(compile(EXAMPLES[0], str(README), "exec"), {"__name__": "readme"})
+    assert "success after" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("line", COMMAND_LINES)
+def test_commands_exist_and_know_their_keys(line, capsys):
+    command, *arguments = shlex.split(line)
+    assert command in COMMANDS
+    if "--help" in arguments:
+        return
+    assert main([command, "--help"]) == 0
+    known = capsys.readouterr().out
+    for argument in arguments:
+        assert argument.partition("=")[0].partition(".")[0] in known
+
+
+@pytest.mark.parametrize("line", [line for line in COMMAND_LINES if line.startswith(("plan", "workspace", "evaluate policy=pretrained"))])
+def test_quick_commands_succeed(line, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(shlex.split(line)) == 0
