@@ -28,6 +28,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(STAMP)
+	rm -rf runs/demo
 	$(RUN) train out=runs/demo
 	$(RUN) evaluate policy=runs/demo episodes=10000 json=runs/demo/evaluation.json
 	$(RUN) evaluate policy=exact episodes=10000 json=runs/demo/exact.json

@@ -78,10 +78,7 @@ class BoxSac(BoxAlgorithm):
         super().__init__(rules, config, generator)
         inputs = observation_size(rules.config.layout)
         self.net = mlp(inputs, self.config.hidden, 2 * ACTIONS).to(self.device)
-        parameters = TensorDictModule(nn.Sequential(self.net, NormalParamExtractor()), in_keys=["observation"], out_keys=["loc", "scale"])
-        self.policy = ProbabilisticActor(
-            parameters, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True, spec=box_spec(self.device)
-        )
+        self.policy = gaussian_policy(self.net, self.device)
         value = ValueOperator(StateActionValue(inputs, self.config.hidden).to(self.device), in_keys=["observation", "action"])
         loss = SACLoss(self.policy, value, num_qvalue_nets=2, loss_function="l2", action_spec=box_spec(self.device))
         self._finish(
@@ -168,6 +165,13 @@ class Td3(BoxAlgorithm):
             self.actor_optimizer.step()
             self.target.step()
         return {"loss_critic": losses["loss_qvalue"].detach(), "loss_actor": losses["loss_actor"].detach()}
+
+
+def gaussian_policy(net: nn.Module, device: torch.device) -> ProbabilisticActor:
+    """Tanh-Gaussian policy of a network (n, size) -> (n, 8): four means, four raw scales."""
+    parameters = TensorDictModule(nn.Sequential(net, NormalParamExtractor()), in_keys=["observation"], out_keys=["loc", "scale"])
+    keys = ["loc", "scale"]
+    return ProbabilisticActor(parameters, in_keys=keys, distribution_class=TanhNormal, return_log_prob=True, spec=box_spec(device))
 
 
 def box_spec(device: torch.device) -> Bounded:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import NormalParamExtractor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from marl_handover.learning.algorithm import Algorithm
-from marl_handover.learning.box import ACTIONS, box_spec
+from marl_handover.learning.box import ACTIONS, gaussian_policy
 from marl_handover.learning.networks import mlp
 from marl_handover.learning.settings import PpoConfig, TrainConfig
 from marl_handover.task.observations import observation_size
@@ -29,10 +28,7 @@ class Ppo(Algorithm):
         super().__init__(rules, config, generator)
         inputs = observation_size(rules.config.layout)
         self.net = mlp(inputs, self.config.hidden, 2 * ACTIONS).to(self.device)
-        parameters = TensorDictModule(nn.Sequential(self.net, NormalParamExtractor()), in_keys=["observation"], out_keys=["loc", "scale"])
-        self.policy = ProbabilisticActor(
-            parameters, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True, spec=box_spec(self.device)
-        )
+        self.policy = gaussian_policy(self.net, self.device)
         value = ValueOperator(mlp(inputs, self.config.hidden, 1).to(self.device), in_keys=["observation"])
         self.loss = ClipPPOLoss(
             self.policy,
@@ -84,7 +80,3 @@ class Ppo(Algorithm):
                 nn.utils.clip_grad_norm_(self.loss.parameters(), self.config.max_grad_norm)
                 self.optimizer.step()
         return {"loss_critic": losses["loss_critic"].detach(), "loss_actor": losses["loss_objective"].detach()}
-
-    def gradient_steps(self, transitions: int) -> int:
-        """Gradient steps that :meth:`update` takes on a roll-out of so many transitions."""
-        return self.config.epochs * -(-transitions // self.config.batch_size)
