@@ -92,7 +92,10 @@ class SupervisorEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        fresh = self.batch_size[0] if mask is None else int(mask.sum())
+        rows = None if mask is None else mask.reshape(-1).nonzero()[:, 0]
+        # TorchRL takes only the rows that are reset. Where these are many, drawing for all cells costs less than putting some in place.
+        everyone = rows is None or len(rows) * 4 >= self.batch_size[0]
+        fresh = self.batch_size[0] if everyone or rows is None else len(rows)
         pose, goal = sample_problems(self.rules.cell, fresh, self.generator, torch.float32)
         epsilon = self.draw_epsilon(fresh)
         previous = torch.full((fresh,), -1, device=self.device)
@@ -105,17 +108,14 @@ class SupervisorEnv(EnvBase):
             "previous_arm": zero - 1,
             "epsilon": epsilon[:, None],
             "transfers": zero,
-            "placed": pose,
+            "placed": pose.clone(),
             "feasible": torch.ones_like(zero, dtype=torch.bool),
             "outcome": zero,
         }
-        if mask is None or fresh == self.batch_size[0]:
-            return TensorDict({key: value.clone() for key, value in new.items()}, self.batch_size, device=self.device)
-        rows = mask.reshape(-1)
-        for key, value in new.items():
-            whole = value.new_zeros(self.batch_size + value.shape[1:])  # TorchRL takes only the reset rows
-            whole[rows] = value
-            new[key] = whole
+        if rows is not None and not everyone:
+            for key, value in new.items():
+                new[key] = value.new_zeros(self.batch_size + value.shape[1:])
+                new[key][rows] = value
         return TensorDict(new, self.batch_size, device=self.device)
 
     def _noise(self) -> Tensor | None:
