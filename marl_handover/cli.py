@@ -80,6 +80,10 @@ def _guarded(name: str, arguments: list[str]) -> int:
         if debug:
             raise
         return _fail(speaker, str(error), error.exit_status)
+    except OSError as error:
+        if debug:
+            raise
+        return _fail(speaker, f"cannot read or write {error.filename or 'a file'}: {error.strerror or error}", EXIT_BAD_INPUT)
     except Exception as error:
         if debug:
             raise

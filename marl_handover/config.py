@@ -96,6 +96,8 @@ class TaskConfig:
         require_at_least("noise.position_mm", self.noise.position_mm, 0)
         require_at_least("noise.yaw_deg", self.noise.yaw_deg, 0)
         require_at_least("reward.motion_weight", self.reward.motion_weight, 0)
+        for name in ("success", "step", "failure"):
+            require_between(f"reward.{name}", getattr(self.reward, name), -1e6, 1e6)
 
 
 def require_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
@@ -116,7 +118,8 @@ def require_at_least(name: str, value: float, least: float) -> None:
         raise InvalidSetting(name, value, f"a finite number, at least {least:g}")
 
 
-MAX_SEED = 2**31 - 1
+MAX_SEED = 10**9 - 2
+"""Seeds above are kept for the problems of reports and of validation."""
 
 
 def require_seed(seed: int) -> None:

@@ -121,11 +121,3 @@ class CheckpointMismatch(HandoverError):
     def __init__(self, path: Path | str, key: str, stored: Any, wanted: Any) -> None:
         super().__init__(f"checkpoint {path} has {key} = {stored!r}, but {wanted!r} was asked for")
         self.path, self.key, self.stored, self.wanted = Path(path), key, stored, wanted
-
-
-class MissingDependency(HandoverError):
-    """An optional package is not installed."""
-
-    def __init__(self, package: str, extra: str) -> None:
-        super().__init__(f"{package} is not installed; run: pip install 'marl_handover[{extra}]'")
-        self.package, self.extra = package, extra

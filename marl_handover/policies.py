@@ -13,7 +13,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -214,7 +214,7 @@ def adapted(name: str, cell: CellConfig | None = None, task: TaskConfig | None =
     Args:
         name: as in :func:`load`.
         cell: settings of another cell.
-        task: settings of another task; a trained policy keeps its architecture.
+        task: what differs from the default task here is put over the policy's own task.
         seed: of ``random``.
         changes: single task settings put over that; None leaves one as it is.
 
@@ -223,14 +223,19 @@ def adapted(name: str, cell: CellConfig | None = None, task: TaskConfig | None =
     """
     own = load(name, seed=seed)
     trained = own.rules.config.architecture if isinstance(own, NetworkPolicy) else None
-    settings = task or own.rules.config
-    if trained and settings.architecture == TaskConfig().architecture:
-        settings = replace(settings, architecture=trained)
+    settings = replace(own.rules.config, **_changes(task, TaskConfig()))
     settings = replace(settings, **{key: value for key, value in changes.items() if value is not None})
     settings.validate()
     if trained and settings.architecture != trained:
         raise CheckpointMismatch(name, "architecture", trained, settings.architecture)
     return own.under(Rules(own.rules.cell if cell is None else load_cell(cell), settings))
+
+
+def _changes(asked: TaskConfig | None, default: TaskConfig) -> dict[str, Any]:
+    """The fields in which ``asked`` differs from the default."""
+    if asked is None:
+        return {}
+    return {field.name: getattr(asked, field.name) for field in fields(asked) if getattr(asked, field.name) != getattr(default, field.name)}
 
 
 def stored_settings(about: Mapping[str, Any]) -> tuple[CellConfig, TaskConfig]:
@@ -269,12 +274,17 @@ def read_policy(path: Path) -> dict[str, NDArray[Any]]:
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}
         about = json.loads(str(arrays["about"]))
+        width = arrays["weight_0"].shape[0]
         for index in range(about["layers"]):
-            arrays[f"weight_{index}"], arrays[f"bias_{index}"]
+            weight, bias = arrays[f"weight_{index}"], arrays[f"bias_{index}"]
+            if weight.shape != (width, len(bias)):
+                raise ValueError(f"layer {index} has shape {weight.shape}")
+            width = len(bias)
         if about["kind"] not in KINDS:
             raise ValueError(f"its kind is {about['kind']!r}, not one of {', '.join(KINDS)}")
         observation_size(about["layout"])
         stored_settings(about)
     except Exception as error:  # numpy, zip and json raise many kinds
-        raise CorruptFile("policy file", path, str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+        reason = str(error).splitlines()[0] if isinstance(error, (KeyError, TypeError)) or "layer" in str(error) else "damaged or no policy"
+        raise CorruptFile("policy file", path, f"{reason}; export it again") from error
     return arrays

@@ -32,7 +32,7 @@ class EvaluateCommand:
     epsilon_deg: float | None = None  # allowed orientation error
     architecture: str | None = None  # A or B
     cell: CellConfig | None = None  # single keys change the paper cell
-    task: TaskConfig | None = None  # single keys change the default task; a trained policy keeps its architecture
+    task: TaskConfig | None = None  # single keys change the policy's own task
     problems: str = ""  # JSON Lines of problems instead of random ones
     json: str = ""  # file for the result
     trace: str = ""  # file for every transfer

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from marl_handover.arrays import wrap
 from marl_handover.cell import NO_ARM
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.config import CellConfig, NoiseConfig
+from marl_handover.config import CellConfig, NoiseConfig, require_seed
 from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, WorkFailed
 from marl_handover.policies import SupervisorPolicy, adapted
 from marl_handover.task.planner import ExactPlanner
@@ -49,6 +49,7 @@ def run(config: PlanConfig) -> int:
 
     if config.picture:
         require_picture("picture", config.picture)
+    require_seed(config.seed)
     poses = {name: _pose(name, getattr(config, name)) for name in ("start", "goal")}
     policy = _policy(config)
     rules = policy.rules

@@ -4,25 +4,31 @@ from __future__ import annotations
 
 import logging
 import sys
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from marl_handover.errors import InvalidSetting, MissingFile
-from marl_handover.learning.checkpoint import FILE, load_checkpoint
-from marl_handover.learning.export import train_config
+from marl_handover.errors import CheckpointMismatch, InvalidSetting, MissingFile
 from marl_handover.learning.settings import ALGORITHMS, TrainConfig
-from marl_handover.learning.trainer import Trainer
+
+if TYPE_CHECKING:
+    from marl_handover.learning.trainer import Trainer
 
 SCHEMA = TrainConfig
 ALIASES = {"architecture": "task.architecture", "epsilon_deg": "task.epsilon_deg"}
 GROUPS = {"algorithm": ALGORITHMS}
+FREE_ON_RESUME = ("resume", "out", "progress")
 
 
 def run(config: TrainConfig) -> int:
     """Start a run, or continue one from its last checkpoint with the settings it was started with."""
+    from marl_handover.learning.checkpoint import FILE
+    from marl_handover.learning.trainer import Trainer
+
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     if config.resume:
-        trainer = resumed(Path(config.resume), config.progress)
+        trainer = resumed(Path(config.resume), config)
     else:
         folder = Path(config.out or datetime.now().strftime("runs/%Y%m%d-%H%M%S"))
         if folder.exists() and not folder.is_dir():
@@ -41,16 +47,37 @@ def run(config: TrainConfig) -> int:
     return 0
 
 
-def resumed(folder: Path, progress: bool = True) -> Trainer:
-    """A trainer that stands where the run in ``folder`` was last saved, or at its start if it never was."""
-    if folder.is_dir() and not (folder / FILE).exists() and (folder / "config.yaml").exists():
-        config = train_config((folder / "config.yaml").read_text(encoding="utf-8"), folder / "config.yaml")
-        config.progress = progress
-        return Trainer(config, folder)
+def resumed(folder: Path, asked: TrainConfig | None = None) -> Trainer:
+    """A trainer that stands where the run in ``folder`` was last saved, or at its start if it never was.
+
+    Raises:
+        CheckpointMismatch: ``asked`` changes a setting; a run keeps the ones it was started with.
+    """
+    from marl_handover.learning.checkpoint import FILE, load_checkpoint
+    from marl_handover.learning.export import train_config
+    from marl_handover.learning.trainer import Trainer
+
     if not folder.is_dir():
         raise MissingFile("run directory", folder)
-    config = train_config(load_checkpoint(folder)["config"], folder / FILE)
-    config.progress = progress
+    unsaved = not (folder / FILE).exists() and (folder / "config.yaml").exists()
+    source = folder / ("config.yaml" if unsaved else FILE)
+    text = source.read_text(encoding="utf-8", errors="replace") if unsaved else load_checkpoint(folder)["config"]
+    config = train_config(text, source)
+    asked = asked or TrainConfig(progress=False)
+    own, wanted, default = (_flat(asdict(settings)) for settings in (config, asked, TrainConfig()))
+    for key, value in wanted.items():
+        if key not in FREE_ON_RESUME and value != default.get(key) and value != own.get(key):
+            raise CheckpointMismatch(source, key, own.get(key), value)
+    config.progress = asked.progress
     trainer = Trainer(config, folder)
-    trainer.restore()
+    if not unsaved:
+        trainer.restore()
     return trainer
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted key."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat

@@ -83,7 +83,13 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
             raise NotFinite("action", list(action))
         left = np.asarray(self.rules.config.max_steps - self._transfers)
         result = self.rules.step(
-            self._pose, self._goal, self._previous, np.asarray(action, np.float64), transfers_left=left, noise=self._noise()
+            self._pose,
+            self._goal,
+            self._previous,
+            np.asarray(action, np.float64),
+            transfers_left=left,
+            noise=self._noise(),
+            final_noise=self._noise(),
         )
         penalty = self.rules.motion_penalty(result.command.arm, self._pose, result.placed)
         self._pose, self._previous = result.pose, result.previous_arm
@@ -92,6 +98,7 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         truncated = not terminated and self._transfers >= self.rules.config.max_steps
         outcome = Outcome.TIMEOUT if truncated else Outcome(int(result.outcome))
         info = self._info(bool(result.feasible), bool(result.command.final), outcome, float(penalty))
+        info["room"] = bool(left > 1) or (int(result.transfers) == 1 and int(result.external_arm) >= 0)
         return self._observation(), float(result.reward), terminated, truncated, info
 
     def compute_reward(
@@ -102,15 +109,19 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         Args:
             achieved_goal: (3,) or (n, 3).
             desired_goal: (3,) or (n, 3).
-            info: one mapping or one a row, read for ``feasible`` (True if absent), ``final`` (False if absent) and
-            ``motion_penalty`` (0 if absent).
+            info: one mapping or one a row, read for ``feasible`` (True if absent), ``final`` (False if absent), ``motion_penalty``
+                (0 if absent) and, in architecture A, ``room``: whether the step limit leaves room for the external transfer
+                (True if absent).
 
         Returns:
             A float, or (n,) rewards.
         """
         final, feasible = self._flags(info, np.shape(achieved_goal)[:-1])
         achieved, desired = np.asarray(achieved_goal, np.float64), np.asarray(desired_goal, np.float64)
-        reward = self.rules.judge(achieved, desired, final, feasible).reward - self._read(info, "motion_penalty", 0.0, final.shape)
+        reward = self.rules.judge(achieved, desired, final, feasible).reward
+        if self.rules.external_finish:
+            reward = np.where(self._read(info, "room", True, final.shape), reward, -1.0)
+        reward = reward - self._read(info, "motion_penalty", 0.0, final.shape)
         return float(reward) if np.ndim(reward) == 0 else reward
 
     def compute_terminated(

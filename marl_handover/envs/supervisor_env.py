@@ -80,7 +80,9 @@ class SupervisorEnv(EnvBase):
         self.epsilon_range_rad = (math.radians(low_deg), math.radians(high_deg))
 
     def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
+        if seed is None:
+            self.generator.seed()
+        else:
             self.generator.manual_seed(seed)
 
     def draw_epsilon(self, count: int) -> Tensor:
@@ -137,6 +139,7 @@ class SupervisorEnv(EnvBase):
             transfers_left=limit - transfers[:, 0],
             epsilon_rad=epsilon,
             noise=self._noise(),
+            final_noise=self._noise(),
         )
         transfers = transfers + result.transfers[:, None]
         terminated = result.terminated[:, None]

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import shutil
+import sysconfig
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from marl_handover.errors import InvalidSetting
 from marl_handover.learning.settings import AlgorithmConfig, TrainConfig
 from marl_handover.task.rules import Rules
+
+logger = logging.getLogger(__name__)
 
 
 class Algorithm(ABC):
@@ -23,7 +30,6 @@ class Algorithm(ABC):
     """
 
     kind: ClassVar[str]
-    on_policy: ClassVar[bool] = False
 
     config: AlgorithmConfig
 
@@ -71,12 +77,46 @@ class Algorithm(ABC):
 
 
 def compiled(function: Callable[..., Any], mode: str) -> Callable[..., Any]:
-    """``function`` compiled, or itself: ``mode`` is ``on``, ``off`` or ``auto`` (compile where a C++ compiler is found)."""
-    if mode == "off" or (mode == "auto" and not can_compile()):
+    """``function`` compiled, or itself.
+
+    Args:
+        function: takes and returns tensors.
+        mode: ``off``; ``auto``: compile where that is possible, else say so in one line and run it as it is; ``on``: or raise.
+
+    Raises:
+        InvalidSetting: ``on`` without a compiler.
+    """
+    if mode == "on" and not can_compile():
+        raise InvalidSetting("compile", mode, "auto or off on a machine without a C++ compiler and Python's headers (see doctor)")
+    if mode == "off" or not can_compile():
         return function
-    return torch.compile(function, dynamic=False)
+    fast = torch.compile(function, dynamic=False)
+    return fast if mode == "on" else _Fallback(function, fast)
+
+
+class _Fallback:
+    """Calls the compiled function; if compiling fails, the plain one, from then on."""
+
+    def __init__(self, plain: Callable[..., Any], fast: Callable[..., Any]) -> None:
+        self.plain, self.chosen, self.proven = plain, fast, False
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self.proven:
+            return self.chosen(*arguments)
+        try:
+            result = self.chosen(*arguments)
+        except Exception as error:  # the compiler's failures have many types
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            logger.warning("torch.compile failed (%s); training goes on uncompiled, which is slower", reason)
+            self.chosen = self.plain
+            result = self.plain(*arguments)
+        self.proven = True
+        return result
 
 
 def can_compile() -> bool:
-    """Whether ``torch.compile`` has the C++ compiler it needs on this machine."""
-    return any(shutil.which(name) for name in ("g++", "clang++"))
+    """Whether ``torch.compile`` finds what it needs on this machine: a C++ compiler, and Python's header files."""
+    chosen = os.environ.get("CXX")
+    names = (chosen,) if chosen else ("g++", "clang++")
+    header = Path(sysconfig.get_path("include")) / "Python.h"
+    return any(shutil.which(name) for name in names) and header.exists()

@@ -42,7 +42,7 @@ def load_checkpoint(folder: Path, device: str | torch.device = "cpu") -> dict[st
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # torch raises many kinds, from zip, pickle and its own
-        raise CorruptFile("checkpoint", path, str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+        raise CorruptFile("checkpoint", path, "it is truncated or no checkpoint; restore a copy or train again") from error
     if not isinstance(state, dict) or "format" not in state:
         raise CorruptFile("checkpoint", path, "it holds no marl_handover state")
     if state["format"] != FORMAT:

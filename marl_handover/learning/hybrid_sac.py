@@ -49,24 +49,28 @@ class HybridSacLoss(LossModule):
         start = math.log(config.initial_temperature)
         self.log_temperatures = nn.Parameter(torch.tensor([start, start]))  # of places, of branches
 
-    def afterstates(self, pose: Tensor, goal: Tensor, place: Tensor, epsilon: Tensor) -> Tensor:
-        """What follows if each arm placed at ``place`` (n, arms, m, 2): blocks (n, arms, m, 2, fields), the acting arm's first."""
+    def afterstates(self, batch: dict[str, Tensor], place: Tensor) -> Tensor:
+        """What follows if each arm placed at ``place`` (n, arms, m, 2): blocks (n, arms, m, 2, fields), the acting arm's first.
+
+        ``batch`` gives ``pose``, ``goal``, ``previous_arm`` and ``epsilon``.
+        """
         arms = self.rules.cell.num_arms
         shape = place.shape[:-1]
         arm = torch.arange(arms, device=place.device)[:, None].expand(shape)
         command = Command(
             torch.zeros(shape, dtype=torch.bool, device=place.device), arm, self.rules.cell.chart.to_table(place[..., 0], place[..., 1])
         )
-        goal = goal[:, None, None].expand(*shape, 3)
-        placed, _ = self.rules.transfer(pose[:, None, None].expand(*shape, 3), goal, command)
-        blocks = arm_blocks(observe(self.rules, "relative", placed, goal, arm, epsilon[:, None, None].expand(shape)))
+        pose, goal = (batch[key][:, None, None].expand(*shape, 3) for key in ("pose", "goal"))
+        before, epsilon = (batch[key][:, None, None].expand(shape) for key in ("previous_arm", "epsilon"))
+        placed, feasible = self.rules.transfer(pose, goal, command)
+        blocks = arm_blocks(observe(self.rules, "relative", placed, goal, torch.where(feasible, arm, before), epsilon))
         return torch.stack([blocks[:, index].roll(-index, -2) for index in range(arms)], 1)
 
     def soft_value(self, critic: AfterstateCritic, batch: dict[str, Tensor], noise: Tensor) -> SoftValue:
         """Soft value of the present policy under ``critic``, from ``pose``, ``goal``, ``epsilon`` and ``observation``."""
         branches = self.actor(batch["observation"])
         place, place_log_prob = squashed_sample(branches, noise)
-        following = self.afterstates(batch["pose"], batch["goal"], place, batch["epsilon"])
+        following = self.afterstates(batch, place)
         place_value = critic.value_place(following).amin(0)
         final_value = critic.value_final(arm_blocks(batch["observation"])).amin(0)
         temperature = self.log_temperatures.detach().exp()
@@ -125,7 +129,7 @@ class HybridSacLoss(LossModule):
 
     def _place_value(self, batch: dict[str, Tensor], places: Tensor) -> Tensor:
         """The lower of both critics' values (n, arms, m) of places (n, arms, m, 2)."""
-        return self.critic.value_place(self.afterstates(batch["pose"], batch["goal"], places, batch["epsilon"])).amin(0)
+        return self.critic.value_place(self.afterstates(batch, places)).amin(0)
 
     def temperature_loss(self, branch_entropy: Tensor, place_entropy: Tensor, targets: tuple[float, float]) -> Tensor:
         """Raises a temperature whose entropy (of places, of branches) is below its target."""
@@ -150,10 +154,12 @@ def unpacked(batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor
         "pose": batch["achieved_goal"],
         "goal": batch["desired_goal"],
         "epsilon": batch["epsilon"][:, 0],
+        "previous_arm": batch["previous_arm"][:, 0],
         "arm": batch["arm"][:, 0],
         "final": batch["final"][:, 0],
     }
     following = {
+        "previous_arm": batch["next", "previous_arm"][:, 0],
         "observation": batch["next", "observation"],
         "pose": batch["next", "achieved_goal"],
         "goal": batch["desired_goal"],

@@ -21,7 +21,6 @@ class Ppo(Algorithm):
     """On-policy: :meth:`update` takes a whole roll-out (num_envs, time)."""
 
     kind = "box"
-    on_policy = True
     config: PpoConfig
 
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:

@@ -101,8 +101,9 @@ class HindsightReplayBuffer(HERReplayBuffer):
         reward = verdict.reward - self.rules.motion_penalty(arm, batch["achieved_goal"], batch["placed"])
         return reward[:, None], verdict.terminated[:, None]
 
-    def sample_transitions(self, count: int) -> TensorDict:
-        """``count`` transitions drawn uniformly, relabelled, mirrored if the settings say so, and judged at the present epsilon."""
+    def sample(self, batch_size: int | None = None, return_info: bool = False) -> TensorDict:
+        """``batch_size`` transitions drawn uniformly, relabelled, mirrored if the settings say so, and judged at the present epsilon."""
+        count = batch_size or 1
         index = torch.randint(len(self), (count,), generator=self.draw, device=self.draw.device)
         batch = self._storage.get(index)
         batch["final"] = self.rules.decode(batch["action"]).final
@@ -110,7 +111,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
         own = batch["desired_goal"]
         self._relabel_hindsight(batch, index)
         self._relabel_random(batch, index)
-        self._keep_unsolved(batch, own)
+        self._finish_externally(batch)
         if self.config.symmetry:
             self._mirror(batch)
         reward, terminated = self._judge(batch)
@@ -142,14 +143,19 @@ class HindsightReplayBuffer(HERReplayBuffer):
             batch["final"] = batch["final"] | (chosen & own)
         batch["hindsight"] = chosen[:, None]
 
-    def _keep_unsolved(self, batch: TensorDictBase, own: Tensor) -> None:
-        """Architecture A: a goal that the object could be taken to before the action would have ended the episode there;
-        such get their own back.
+    def _finish_externally(self, batch: TensorDictBase) -> None:
+        """Architecture A: whether the command was ignored, because the episode was solved at its start, depends on goal and epsilon.
+
+        A command that was ignored when it was stored is executed now if it would be; one that would be ignored leaves the object.
         """
-        if self.rules.external_finish:
-            solved = self.rules.can_finish(batch["achieved_goal"], batch["desired_goal"], batch["epsilon"][:, 0]).any(-1)
-            batch["desired_goal"] = one_where(solved, own, batch["desired_goal"])
-            batch["hindsight"] = batch["hindsight"] & ~solved[:, None]
+        if not self.rules.external_finish:
+            return
+        pose, goal = batch["achieved_goal"], batch["desired_goal"]
+        moved, feasible = self.rules.transfer(pose, goal, self.rules.decode(batch["action"]))
+        idle = ~batch["feasible"][:, 0]
+        solved = self.rules.can_finish(pose, goal, batch["epsilon"][:, 0]).any(-1)
+        batch["feasible"] = ((batch["feasible"][:, 0] | (idle & feasible)) & ~solved)[:, None]
+        batch["placed"] = one_where(solved, pose, one_where(idle, moved, batch["placed"]))
 
     def _near_miss(self, goal: Tensor, epsilon: Tensor) -> Tensor:
         """Some goals turned a little. What was achieved then misses them, or just not: exact hindsight alone only ever shows
@@ -197,6 +203,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
         following = {
             "observation": observe(self.rules, layout, placed, goal, after, epsilon),
             "achieved_goal": placed,
+            "previous_arm": after[:, None],
             "reward": reward,
             "terminated": terminated,
             "done": terminated,
@@ -207,6 +214,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
                 "achieved_goal": pose,
                 "desired_goal": goal,
                 "epsilon": batch["epsilon"],
+                "previous_arm": batch["previous_arm"],
                 "action": action,
                 "arm": arm[:, None],
                 "final": batch["final"][:, None],

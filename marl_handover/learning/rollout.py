@@ -70,6 +70,7 @@ def play(
             transfers_left=limit - made,
             epsilon_rad=epsilon_rad,
             noise=None if noise is None else noise(len(here)),
+            final_noise=None if noise is None else noise(len(here)),
         )
         if observer is not None:
             observer(Decision(running, here, there, previous, made, result))

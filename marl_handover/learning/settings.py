@@ -14,6 +14,7 @@ from marl_handover.config import (
     require_positive,
     require_seed,
 )
+from marl_handover.errors import InvalidSetting
 
 
 @dataclass
@@ -65,6 +66,11 @@ class AlgorithmConfig:
             require_positive(f"algorithm.{name}", getattr(self, name))
         for name in ("gamma", "decay_from"):
             require_between(f"algorithm.{name}", getattr(self, name), 0, 1)
+        for name in ("hidden", "actor_hidden", "critic_hidden", "final_hidden"):
+            for width in getattr(self, name, []):
+                require_at_least(f"algorithm.{name}", width, 1)
+        if self.layout == "object":
+            raise InvalidSetting("algorithm.layout", self.layout, "'raw' or 'relative'; 'object' hides the goal")
 
 
 @dataclass
@@ -141,6 +147,14 @@ class Td3Config(OffPolicyConfig):
     random_action: float = 0.2  # share of exploration actions drawn uniformly
     target_noise: float = 0.1
 
+    def validate(self) -> None:
+        """As the base class, and what only this algorithm has."""
+        super().validate()
+        require_at_least("algorithm.policy_delay", self.policy_delay, 1)
+        require_between("algorithm.random_action", self.random_action, 0, 1)
+        for name in ("exploration_std", "target_noise"):
+            require_at_least(f"algorithm.{name}", getattr(self, name), 0)
+
 
 @dataclass
 class PpoConfig(AlgorithmConfig):
@@ -156,6 +170,16 @@ class PpoConfig(AlgorithmConfig):
     entropy: float = 0.003
     max_grad_norm: float = 0.5
     hidden: list[int] = field(default_factory=lambda: [256, 256])
+
+    def validate(self) -> None:
+        """As the base class, and what only this algorithm has."""
+        super().validate()
+        for name in ("rollout_steps", "epochs"):
+            require_at_least(f"algorithm.{name}", getattr(self, name), 1)
+        for name in ("clip", "max_grad_norm"):
+            require_positive(f"algorithm.{name}", getattr(self, name))
+        require_between("algorithm.gae_lambda", self.gae_lambda, 0, 1)
+        require_at_least("algorithm.entropy", self.entropy, 0)
 
 
 ALGORITHMS: dict[str, type[AlgorithmConfig]] = {"sac": SacConfig, "box_sac": BoxSacConfig, "td3": Td3Config, "ppo": PpoConfig}
@@ -186,6 +210,8 @@ class TrainConfig:
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
+        if self.task.layout not in (TaskConfig().layout, self.algorithm.layout):
+            raise InvalidSetting("task.layout", self.task.layout, "left alone in training; the learner's layout is algorithm.layout")
         self.task.layout = self.algorithm.layout
         self.task.validate()
         require_choice("variant", self.variant, ("hierarchical",))

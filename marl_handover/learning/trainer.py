@@ -80,7 +80,7 @@ class Trainer:
         self.current: TensorDictBase | None = None
 
     def run(self) -> dict[str, Any]:
-        """Train to the end; return (and write) the summary. Interrupting it saves a checkpoint first."""
+        """Train to the end; return (and write) the summary. An interrupted run continues from its last checkpoint."""
         self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(self.folder / "config.yaml", to_yaml(self.config))
         recorder = Recorder(self.folder, self.config.steps, self.counters.step, self.config.progress)
@@ -93,9 +93,6 @@ class Trainer:
                 self._advance()
                 self.counters.wall_s = time.perf_counter() - started
                 self._report(recorder)
-        except KeyboardInterrupt:
-            self.save()
-            raise
         finally:
             recorder.close()
         self.save()
@@ -132,7 +129,7 @@ class Trainer:
         if due <= 0 or len(self.replay) < config.batch_size:
             return
         # One draw for all updates that are due: a draw costs as much as an update.
-        batches = self.replay.sample_transitions(due * config.batch_size).split(config.batch_size)
+        batches = self.replay.sample(due * config.batch_size).split(config.batch_size)
         for batch in batches:
             self.losses = self.algorithm.update(batch)
         self.counters.gradient_step += due
@@ -168,7 +165,8 @@ class Trainer:
         final_stage = self.counters.stage == len(self.config.curriculum) - 1
         excess = 0.0 if math.isnan(self.last["steps_ratio"]) else self.last["steps_ratio"] - 1.0
         score = self.last["success_rate"] - STEPS_WEIGHT * excess
-        if not self.best or (final_stage and score >= self.best["score"]):
+        # Before the last stage, always the present one: scores at another epsilon do not compare.
+        if not (final_stage and self.best and score < self.best["score"]):
             actor = {name: value.detach().clone() for name, value in self.algorithm.actor().state_dict().items()}
             self.best = {"score": score if final_stage else -math.inf, "step": self.counters.step, "actor": actor}
 
@@ -207,7 +205,7 @@ class Trainer:
         episodes = play(self.rules, act, start, goal)
         solved = episodes.outcome == int(Outcome.SUCCESS)
         optimum = ExactPlanner(self.rules).plan(start.double(), goal.double()).transfers
-        ratio = (episodes.transfers / optimum)[solved]
+        ratio = (episodes.transfers / optimum)[solved & (optimum > 0)]
         return {
             "success_rate": float(solved.double().mean()),
             "mean_steps": float(episodes.transfers.double().mean()),

@@ -19,6 +19,10 @@ MotionCost = Callable[[Cell, Array, Array, Array], Array]
 """Cost in mm, shape (...), of a transfer: cell, arm (...), from_mm (..., 2), to_mm (..., 2). Eq. (3) of the paper."""
 
 
+ROUNDING_RAD = 1e-5
+"""An orientation that was foreseen within epsilon does not fail by float32 rounding."""
+
+
 class Outcome(IntEnum):
     """How an episode ended; NONE while it goes on."""
 
@@ -190,6 +194,7 @@ class Rules:
         transfers_left: Array | None = None,
         epsilon_rad: Array | float | None = None,
         noise: Array | None = None,
+        final_noise: Array | None = None,
     ) -> Transition:
         """Apply one decision to a batch.
 
@@ -201,6 +206,7 @@ class Rules:
             transfers_left: int (...), transfers allowed from here; architecture A finishes externally only within it.
             epsilon_rad: scalar or (...); the setting's value if None.
             noise: (..., 3) offset of what is placed: mm, mm, rad.
+            final_noise: (..., 3) the same for architecture A's external transfer.
         """
         xp = namespace(pose)
         command = self.decode(action)
@@ -213,7 +219,7 @@ class Rules:
             after = xp.where(feasible, command.arm, previous_arm)
             reward = verdict.reward - self.motion_penalty(command.arm, pose, placed)
             return Transition(placed, after, placed, command, feasible, none, one, reward, verdict.terminated, verdict.outcome)
-        return self._step_external(pose, goal, previous_arm, command, placed, feasible, transfers_left, epsilon_rad, noise)
+        return self._step_external(pose, goal, previous_arm, command, placed, feasible, transfers_left, epsilon_rad, final_noise)
 
     def _step_external(
         self,
@@ -225,7 +231,7 @@ class Rules:
         feasible: Array,
         transfers_left: Array | None,
         epsilon_rad: Array | float | None,
-        noise: Array | None,
+        final_noise: Array | None,
     ) -> Transition:
         """Architecture A: an object that can be finished is finished; before the command, if it can be already then."""
         xp = namespace(pose)
@@ -241,13 +247,18 @@ class Rules:
         external_arm = xp.where(solved, nearest, -1)
         final_theta = wrap(placed[..., 2] + select(finishing.turn_rad, nearest))
         final_pose = xp.concat([goal[..., :2], final_theta[..., None]], -1)
-        if noise is not None:
-            final_pose = self._displaced(final_pose, one_where(solved, noise, 0 * noise))
+        if final_noise is not None:
+            final_pose = self._displaced(final_pose, final_noise)
         after = xp.where(solved, external_arm, xp.where(feasible, command.arm, previous_arm))
         transfers = xp.where(early, 0, 1) + xp.where(solved, 1, 0)
-        outcome = xp.where(solved, int(Outcome.SUCCESS), int(Outcome.NONE))
+        # On exact hardware the final transfer does what was foreseen; otherwise it is what came of it that counts.
+        offset = xp.sqrt(((final_pose[..., :2] - goal[..., :2]) ** 2).sum(-1))
+        left = abs(self.orientation_error(final_pose[..., 2], goal[..., 2]))
+        there, turned = offset <= self.tolerance_mm, left <= self._epsilon(epsilon_rad, per_arm=False) + ROUNDING_RAD
+        missed = xp.where(there, int(Outcome.WRONG_ORIENTATION), int(Outcome.WRONG_POSITION))
+        outcome = xp.where(solved, xp.where(there & turned, int(Outcome.SUCCESS), missed), int(Outcome.NONE))
         one = xp.ones_like(placed[..., 0])
-        reward = xp.where(solved, 0 * one, -one) - self.motion_penalty(command.arm, pose, placed)
+        reward = xp.where(solved & there & turned, 0 * one, -one) - self.motion_penalty(command.arm, pose, placed)
         pose = one_where(solved, final_pose, placed)
         return Transition(pose, after, placed, command, feasible, external_arm, transfers, reward, solved, outcome)
 

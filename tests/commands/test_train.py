@@ -147,3 +147,11 @@ def test_every_algorithm_validates_with_its_defaults(name):
     config = compose(SCHEMA, [f"algorithm={name}"], groups={"algorithm": ALGORITHMS})
     config.validate()
     assert config.algorithm.name == name
+
+
+def test_a_resumed_run_keeps_its_settings(capsys, tmp_path):
+    folder = tmp_path / "run"
+    assert main(["train", *TINY, f"out={folder}"]) == 0
+    capsys.readouterr()
+    assert_refused(capsys, [f"resume={folder}", "architecture=A"], "task.architecture", "'A'")
+    assert_refused(capsys, [f"resume={folder}", "seed=9"], "seed")

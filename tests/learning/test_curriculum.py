@@ -57,3 +57,12 @@ def test_training_goes_through_its_stages(small, table, tmp_path):
     rows = [(int(row["step"]), round(float(row["epsilon_low_deg"]), 3)) for row in table(tmp_path)]
     expected = [(step, 40 if step <= 256 else 20 if step <= 512 else 10) for step in range(128, 769, 128)]
     assert rows == expected
+
+
+def test_without_the_last_stage_the_latest_actor_is_kept(small, tmp_path):
+    stages = "curriculum=[{epsilon_low_deg:40,epsilon_high_deg:40,until_success:0.9999},{epsilon_low_deg:1,epsilon_high_deg:1}]"
+    trainer = Trainer(small("sac", stages, "evaluation_interval=128", "steps=640"), tmp_path)
+    trainer.run()
+    assert trainer.counters.stage == 0
+    for name, value in trainer.algorithm.actor().state_dict().items():
+        assert value.equal(trainer.best["actor"][name])

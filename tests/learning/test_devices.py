@@ -22,6 +22,26 @@ def test_without_a_compiler_auto_stays_eager(monkeypatch):
     assert algorithm.compiled(function, "off") is function
 
 
+def test_a_failing_compiler_falls_back_and_says_so(monkeypatch, caplog):
+    def broken(function, **_):
+        def call(*arguments):
+            raise RuntimeError("no such compiler")
+
+        return call
+
+    monkeypatch.setattr(algorithm, "can_compile", lambda: True)
+    monkeypatch.setattr(torch, "compile", broken)
+    double = algorithm.compiled(lambda x: 2 * x, "auto")
+    assert (double(3), double(4)) == (6, 8)
+    assert caplog.text.count("uncompiled") == 1
+
+
+def test_on_without_a_compiler_is_refused(monkeypatch):
+    monkeypatch.setattr(algorithm, "can_compile", lambda: False)
+    with pytest.raises(InvalidSetting, match="compile"):
+        algorithm.compiled(abs, "on")
+
+
 def test_a_missing_device_is_named():
     with pytest.raises(InvalidSetting, match="cpu"):
         usable_device("quantum")
@@ -45,7 +65,7 @@ def test_compiled_and_eager_losses_agree(small, tmp_path):
     trainer = Trainer(small("sac", "steps=512"), tmp_path)
     trainer.run()
     loss = trainer.algorithm.loss
-    batch = trainer.replay.sample_transitions(32)
+    batch = trainer.replay.sample(32)
     noise = torch.randn(len(batch), 2, 1, 2)
     inputs = (*unpacked(batch), noise)
     torch.testing.assert_close(algorithm.compiled(loss.critic_loss, "on")(*inputs), loss.critic_loss(*inputs), rtol=1e-4, atol=1e-4)

@@ -9,6 +9,7 @@ import torch
 
 from marl_handover.learning.factory import make_algorithm
 from marl_handover.learning.hybrid_sac import HybridSac, chosen_action, squashed_sample, unpacked
+from marl_handover.learning.networks import arm_blocks
 from marl_handover.task.observations import observe
 
 
@@ -26,7 +27,7 @@ def learner(replay, small) -> HybridSac:
 
 @pytest.fixture
 def batch(replay):
-    return replay.sample_transitions(64)
+    return replay.sample(64)
 
 
 def gradients(module):
@@ -189,3 +190,19 @@ def test_temperature_rises_while_its_entropy_is_too_low(learner):
         gradient = learner.loss.log_temperatures.grad
         assert gradient[which] * surplus > 0  # descent raises the temperature where the surplus is negative
         assert gradient[1 - which] == 0
+
+
+def test_afterstates_are_what_the_rule_book_says_follows(learner, batch):
+    """Also for arms that refuse, after which the previous arm stays what it was."""
+    present, _ = unpacked(batch)
+    place = torch.rand(len(batch), 2, 1, 2) * 2 - 1
+    blocks = learner.loss.afterstates(present, place)
+    for arm in range(2):
+        action = torch.cat([torch.tensor([[-1.0, 2.0 * arm - 1]]).expand(len(batch), 2), place[:, arm, 0]], -1)
+        rules = learner.rules
+        result = rules.step(present["pose"], present["goal"], present["previous_arm"], action, epsilon_rad=present["epsilon"])
+        after = torch.where(result.feasible, arm, present["previous_arm"])
+        seen = arm_blocks(observe(rules, "relative", result.placed, present["goal"], after, present["epsilon"]))
+        commanded = result.transfers > (result.external_arm >= 0)  # architecture A ignores commands of solved problems
+        torch.testing.assert_close(blocks[commanded, arm, 0], seen.roll(-arm, -2)[commanded])
+    assert not result.feasible.all()

@@ -99,7 +99,7 @@ def assert_goals_of_own_episode(batch, strategy, last_step):
 def test_goals_never_leak_across_episodes(paper, rules_of, made_up_episodes, strategy, lengths, seed):
     replay = memory(paper, rules_of, 200, seed, strategy=strategy)
     replay.extend(made_up_episodes(lengths))
-    batch = replay.sample_transitions(100)
+    batch = replay.sample(100)
     assert batch["hindsight"].all()
     assert_goals_of_own_episode(batch, strategy, [length - 1 for length in lengths])
 
@@ -112,7 +112,7 @@ def test_a_full_ring_never_reads_an_overwritten_episode(paper, rules_of, made_up
     replay = memory(paper, rules_of, capacity, seed, strategy=strategy)
     for number, length in enumerate(lengths):
         replay.extend(made_up_episodes([length], first=number))
-        batch = replay.sample_transitions(40)
+        batch = replay.sample(40)
         assert_goals_of_own_episode(batch, strategy, [length - 1 for length in lengths])
         if strategy != "episode":  # later rows are always there
             assert batch["hindsight"].all()
@@ -126,7 +126,7 @@ def test_every_goal_of_an_episode_is_drawn(paper, rules_of, made_up_episodes):
     for strategy, expected in (("future", {2, 3, 4}), ("final", {4}), ("episode", {0, 1, 2, 3, 4})):
         replay = memory(paper, rules_of, 50, strategy=strategy)
         replay.extend(made_up_episodes([3, 5, 4]))
-        batch = replay.sample_transitions(2000)
+        batch = replay.sample(2000)
         own = batch["next", "achieved_goal"]
         rows = (own[:, 0] == 1) & (own[:, 1] == 2)
         assert set(batch["desired_goal"][rows, 1].int().tolist()) == expected
@@ -136,14 +136,14 @@ def test_every_goal_of_an_episode_is_drawn(paper, rules_of, made_up_episodes):
 def test_the_hindsight_ratio_is_kept(paper, rules_of, made_up_episodes, ratio):
     replay = memory(paper, rules_of, 50, ratio=ratio)
     replay.extend(made_up_episodes([5, 5, 5]))
-    share = float(replay.sample_transitions(4000)["hindsight"].double().mean())
+    share = float(replay.sample(4000)["hindsight"].double().mean())
     assert share == pytest.approx(ratio, abs=4 * (ratio * (1 - ratio) / 4000) ** 0.5)
 
 
 def test_near_misses_fill_their_range_and_ratio(paper, rules_of, made_up_episodes):
     replay = memory(paper, rules_of, 50, near_miss_ratio=0.3, near_miss_epsilons=2.0)
     replay.extend(made_up_episodes([5, 5, 5]))
-    turn = replay.sample_transitions(4000)["desired_goal"][:, 2].abs() / EPSILON_RAD
+    turn = replay.sample(4000)["desired_goal"][:, 2].abs() / EPSILON_RAD
     assert float((turn > 0).double().mean()) == pytest.approx(0.3, abs=0.03)
     assert 1.9 < turn.max() <= 2.0 + 1e-5
 
@@ -160,4 +160,4 @@ def test_torchrls_default_relabels_from_before_the_action_and_ours_from_after(pa
     assert set(stock.sample()["desired_goal"][:, 1].tolist()) == {2.0}
     ours = memory(paper, rules_of, 50, strategy="final", near_miss_ratio=0.0)
     ours.extend(rows)
-    assert set(ours.sample_transitions(20)["desired_goal"][:, 1].tolist()) == {3.0}
+    assert set(ours.sample(20)["desired_goal"][:, 1].tolist()) == {3.0}

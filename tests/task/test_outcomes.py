@@ -166,9 +166,20 @@ def test_noise_displaces_what_is_placed_but_nothing_that_was_refused(paper, rule
     np.testing.assert_allclose(placed.pose, [1.0, -2.0, 0.6 - QUARTER], atol=1e-12)
     refused = step(rules, pose(LEFT_END, 0.5), pose(RIGHT_END), R, noise=noise)
     np.testing.assert_array_equal(refused.pose, pose(LEFT_END, 0.5))
-    twice = step(rules_of(paper, "A", noise=NOISY), pose(LEFT_END, QUARTER), pose(RIGHT_END, QUARTER), L, noise=noise * (1, 1, 0))
-    assert twice.outcome == Outcome.SUCCESS
-    np.testing.assert_allclose(twice.pose[:2], np.add(RIGHT_END, (1.0, -2.0)), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("offset", "outcome"),
+    [((3, 3.9, 0), Outcome.SUCCESS), ((3, 4.1, 0), Outcome.WRONG_POSITION), ((0, 0, 0.1), Outcome.WRONG_ORIENTATION)],
+)
+def test_a_noisy_external_finish_is_judged_by_what_came_of_it(paper, rules_of, offset, outcome):
+    rules, start, goal = rules_of(paper, "A", noise=NOISY), pose(LEFT_END, QUARTER), pose(RIGHT_END, QUARTER)
+    exact = step(rules, start, goal, L, noise=np.zeros(3), final_noise=np.zeros(3))
+    shift = np.array(offset, float) - [0, 0, float(rules.orientation_error(exact.pose[2], goal[2]))]
+    result = step(rules, start, goal, L, noise=np.zeros(3), final_noise=shift if offset[2] == 0 else np.array(offset, float))
+    assert (result.outcome, result.terminated) == (outcome, True)
+    assert result.reward == (0 if outcome == Outcome.SUCCESS else -1)
+    np.testing.assert_allclose(result.pose[:2], np.add(RIGHT_END, offset[:2]), atol=1e-12)
 
 
 @pytest.mark.parametrize(
