@@ -14,7 +14,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
 help:
 	@echo "make demo       install, train a supervisor, evaluate it against the exact planner, leave pictures in runs/"
-	@echo "make test       install and run the tests; make test-slow runs the slow ones too"
+	@echo "make test       install and run the tests; make test-slow the slow ones (wheel, SIGKILL, longer learners)"
 	@echo "make check      style, types and import layers; make format repairs the style"
 	@echo "make bench      measure speed, and learning against Stable-Baselines3 (hours)"
 	@echo "make pretrained train the two policies that are shipped"
@@ -40,7 +40,7 @@ test: $(STAMP)
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS)
 
 test-slow: $(STAMP)
-	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) -m "not gpu and not hardware"
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) -m "slow and not gpu and not hardware"
 
 check: $(STAMP)
 	$(BIN)/ruff check .
