@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -48,3 +49,23 @@ def test_commands_exist_and_know_their_keys(line, capsys):
 def test_quick_commands_succeed(line, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(shlex.split(line)) == 0
+
+
+RESULTS = README.parent / "bench" / "results" / "2026-11-22"
+
+
+@pytest.mark.parametrize("run", ["b0", "b1", "b2", "e1", "a0", "pretrained_a", "pretrained_b"])
+def test_the_result_table_says_what_the_runs_say(run):
+    result = json.loads((RESULTS / run / "evaluation.json").read_text())
+    summary = json.loads((RESULTS / run / "summary.json").read_text())
+    assert (result["episodes"], result["seed"]) == (10000, 100)
+    table = TEXT[TEXT.index("| run | success |") : TEXT.index("Beside it,")]
+    rows = [
+        row
+        for row in table.splitlines()
+        if f"{100 * result['success_rate']:.2f}" in row
+        and f"{result['steps_ratio']:.3f}" in row
+        and f"{summary['step']:,} | {summary['gradient_step']:,}" in row
+        and f"{summary['wall_s']:.0f}" in row
+    ]
+    assert len(rows) == 1
