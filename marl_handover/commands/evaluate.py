@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,8 @@ def run(config: EvaluateCommand) -> int:
         "seed": config.seed,
         **result.report(),
     }
+    if rules.noisy:
+        report["noise"] = asdict(rules.config.noise)
     print(table(report, result))
     if config.json:
         write_whole(Path(config.json), json.dumps(report, indent=2) + "\n")
