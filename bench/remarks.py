@@ -42,7 +42,7 @@ def main() -> None:
             if strategy != "none":
                 settings += ["replay.hindsight.ratio=0.8", "replay.hindsight.near_miss_ratio=0", "replay.hindsight.random_ratio=0"]
             marl_handover("train", "preset=paper_a", "progress=false", f"out={run}", *settings)
-        result = evaluated(folder, run.name, f"policy={run}", "task.max_steps=20", f"seed={values['seed']}")
+        result = evaluated(folder, run.name, f"policy={run}", "max_steps=20", f"seed={values['seed']}")
         rows.append([f"paper_a, episodes of {limit}, hindsight {strategy}", *(result[key] for key in MEASURES)])
     header = ["architecture A, epsilon 5 deg, judged on 20 steps", "success", "mean steps", "mean steps of a success"]
     text = table(header, [[str(row[0]), *(f"{value:.3f}" if isinstance(value, float) else "none" for value in row[1:])] for row in rows])

@@ -31,6 +31,7 @@ class EvaluateCommand:
     seed: int = 0  # of the problems and of execution noise
     epsilon_deg: float | None = None  # allowed orientation error
     architecture: str | None = None  # A or B
+    max_steps: int | None = None  # transfers allowed an episode
     cell: CellConfig | None = None  # single keys change the paper cell
     task: TaskConfig | None = None  # single keys change the policy's own task
     problems: str = ""  # JSON Lines of problems instead of random ones
@@ -54,7 +55,7 @@ def run(config: EvaluateCommand) -> int:
             raise MissingFile("folder", Path(path).parent, "make it first")
         if path and Path(path).is_dir():
             raise InvalidSetting(name, path, "a file, not a folder")
-    changes = {"epsilon_deg": config.epsilon_deg, "architecture": config.architecture}
+    changes = {key: getattr(config, key) for key in ("epsilon_deg", "architecture", "max_steps")}
     policy = policies.adapted(config.policy, config.cell, config.task, config.seed, **changes)
     rules = policy.rules
     problems = read_problems(rules, Path(config.problems)) if config.problems else random_problems(rules, config.episodes, config.seed)
