@@ -100,6 +100,19 @@ class TaskConfig:
             require_between(f"reward.{name}", getattr(self.reward, name), -1e6, 1e6)
 
 
+@dataclass
+class TaskChanges:
+    """What to put over a policy's own task; None leaves a setting as the policy brought it."""
+
+    architecture: str | None = None  # A or B
+    epsilon_deg: float | None = None  # allowed orientation error
+    max_steps: int | None = None  # transfers allowed an episode
+    symmetry_order: int | None = None  # the block looks the same when turned by 360/k degrees
+    position_tolerance_mm: float | None = None  # "at the goal" after a noisy final placement
+    reward: RewardConfig | None = None
+    noise: NoiseConfig | None = None
+
+
 def require_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
     """Raise :class:`UnknownChoice` unless ``value`` is one of ``choices``."""
     if value not in choices:

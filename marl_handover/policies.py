@@ -13,7 +13,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -208,34 +208,25 @@ def load(name: str, cell: Cell | None = None, task: TaskConfig | None = None, se
     return NetworkPolicy(Rules(cell or load_cell(own_cell), task or own_task), name, arrays, about)
 
 
-def adapted(name: str, cell: CellConfig | None = None, task: TaskConfig | None = None, seed: int = 0, **changes: Any) -> SupervisorPolicy:
+def adapted(name: str, cell: CellConfig | None = None, seed: int = 0, **changes: Any) -> SupervisorPolicy:
     """A policy by name under its own cell and task, except where the caller says otherwise.
 
     Args:
         name: as in :func:`load`.
         cell: settings of another cell.
-        task: what differs from the default task here is put over the policy's own task.
         seed: of ``random``.
-        changes: single task settings put over that; None leaves one as it is.
+        changes: task settings put over the policy's own; None leaves one as it is.
 
     Raises:
         CheckpointMismatch: ``architecture`` is asked for and the policy was trained for the other one.
     """
     own = load(name, seed=seed)
-    trained = own.rules.config.architecture if isinstance(own, NetworkPolicy) else None
-    settings = replace(own.rules.config, **_changes(task, TaskConfig()))
-    settings = replace(settings, **{key: value for key, value in changes.items() if value is not None})
+    settings = replace(own.rules.config, **{key: value for key, value in changes.items() if value is not None})
     settings.validate()
-    if trained and settings.architecture != trained:
+    trained = own.rules.config.architecture
+    if isinstance(own, NetworkPolicy) and settings.architecture != trained:
         raise CheckpointMismatch(name, "architecture", trained, settings.architecture)
     return own.under(Rules(own.rules.cell if cell is None else load_cell(cell), settings))
-
-
-def _changes(asked: TaskConfig | None, default: TaskConfig) -> dict[str, Any]:
-    """The fields in which ``asked`` differs from the default."""
-    if asked is None:
-        return {}
-    return {field.name: getattr(asked, field.name) for field in fields(asked) if getattr(asked, field.name) != getattr(default, field.name)}
 
 
 def stored_settings(about: Mapping[str, Any]) -> tuple[CellConfig, TaskConfig]:

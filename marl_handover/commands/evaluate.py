@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from marl_handover import policies
-from marl_handover.config import CellConfig, TaskConfig, require_at_least, require_choice, require_seed
+from marl_handover.config import CellConfig, TaskChanges, require_at_least, require_choice, require_seed
 from marl_handover.errors import InvalidSetting, MissingFile
 from marl_handover.learning.evaluation import Evaluation, evaluate, random_problems, read_problems
 from marl_handover.learning.recorder import write_whole
@@ -29,11 +29,8 @@ class EvaluateCommand:
     backend: str = "kinematic"  # where transfers are executed
     episodes: int = 1000  # random problems
     seed: int = 0  # of the problems and of execution noise
-    epsilon_deg: float | None = None  # allowed orientation error
-    architecture: str | None = None  # A or B
-    max_steps: int | None = None  # transfers allowed an episode
     cell: CellConfig | None = None  # single keys change the paper cell
-    task: TaskConfig | None = None  # single keys change the policy's own task
+    task: TaskChanges = field(default_factory=TaskChanges)
     problems: str = ""  # JSON Lines of problems instead of random ones
     json: str = ""  # file for the result
     trace: str = ""  # file for every transfer
@@ -41,7 +38,7 @@ class EvaluateCommand:
 
 
 SCHEMA = EvaluateCommand
-ALIASES: dict[str, str] = {}
+ALIASES = {key: f"task.{key}" for key in ("epsilon_deg", "architecture", "max_steps")}
 GROUPS: dict[str, dict[str, type]] = {}
 
 
@@ -55,8 +52,7 @@ def run(config: EvaluateCommand) -> int:
             raise MissingFile("folder", Path(path).parent, "make it first")
         if path and Path(path).is_dir():
             raise InvalidSetting(name, path, "a file, not a folder")
-    changes = {key: getattr(config, key) for key in ("epsilon_deg", "architecture", "max_steps")}
-    policy = policies.adapted(config.policy, config.cell, config.task, config.seed, **changes)
+    policy = policies.adapted(config.policy, config.cell, config.seed, **vars(config.task))
     rules = policy.rules
     problems = read_problems(rules, Path(config.problems)) if config.problems else random_problems(rules, config.episodes, config.seed)
     trace = Trace(rules) if config.trace else None

@@ -130,7 +130,8 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         """Whether the episode ends there; arguments as in :meth:`compute_reward`. A relabelled transition needs both."""
         final, feasible = self._flags(info, np.shape(achieved_goal)[:-1])
         achieved, desired = np.asarray(achieved_goal, np.float64), np.asarray(desired_goal, np.float64)
-        return self.rules.judge(achieved, desired, final, feasible).terminated
+        terminated = self.rules.judge(achieved, desired, final, feasible).terminated
+        return terminated & self._read(info, "room", True, final.shape) if self.rules.external_finish else terminated
 
     @staticmethod
     def _read(info: Any, key: str, absent: Any, shape: tuple[int, ...]) -> NDArray[Any]:

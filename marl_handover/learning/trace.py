@@ -78,7 +78,7 @@ class Trace:
             "reward": 0.0 if commanded else float(result.reward[row]),
             "terminated": True,
             "truncated": False,
-            "outcome": "success",
+            "outcome": Outcome(int(result.outcome[row])).name.lower(),
             "epsilon_rad": self.rules.epsilon_rad,
         }
 

@@ -248,3 +248,26 @@ def test_a_corrupt_run_is_refused(capsys, tmp_path, run_b):
     content = (run_b / "checkpoint.pt").read_bytes()
     (tmp_path / "checkpoint.pt").write_bytes(content[: len(content) // 2])
     assert_refused(capsys, ["evaluate", f"policy={tmp_path}"], "checkpoint")
+
+
+def test_a_typed_default_still_overrides_the_policys_own(tmp_path):
+    """Asked for by value, not by difference: 5 degrees is the default, and not what this policy came with."""
+    policy = policies.adapted("exact", epsilon_deg=1.0, max_steps=7)
+    assert (policy.rules.config.epsilon_deg, policy.rules.config.max_steps) == (1.0, 7)
+    for key in ("epsilon_deg=5", "task.epsilon_deg=5"):
+        assert evaluated(tmp_path, "policy=pretrained_b", "episodes=5", key)[0]["epsilon_deg"] == 5.0
+
+
+@pytest.mark.parametrize("policy", ["pretrained_a", "pretrained_b"])
+def test_even_the_default_architecture_is_refused_to_the_other_policy(capsys, policy):
+    other = {"pretrained_a": "B", "pretrained_b": "A"}[policy]
+    for key in ("architecture", "task.architecture"):
+        assert_refused(capsys, ["evaluate", f"policy={policy}", f"{key}={other}"], "architecture", other)
+
+
+def test_a_noisy_external_finish_is_traced_as_what_it_was(tmp_path):
+    result, lines = evaluated(tmp_path, "policy=exact", "architecture=A", "episodes=200", "task.noise.yaw_deg=8")
+    ends = [line["outcome"] for line in lines if line["terminated"] or line["truncated"]]
+    assert {outcome: ends.count(outcome) for outcome in OUTCOMES} == result["outcomes"]
+    assert result["outcomes"]["wrong_orientation"] > 0
+    assert result["noise"] == {"position_mm": 0.0, "yaw_deg": 8.0}
