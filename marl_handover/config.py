@@ -101,6 +101,29 @@ class TaskConfig:
 
 
 @dataclass
+class MotionConfig:
+    """How an arm moves: clearances, the way over the table, limits of speed. Facts and reasons: docs of ``marl_handover.motion``."""
+
+    parked_deg: list[float] = field(default_factory=lambda: [0.0, 140.0, -115.0, 70.0, 0.0])  # upright, clear of the shared space
+    arm_clearance_mm: float = 5.0  # between the moving arm, with what it carries, and the other one
+    ground_clearance_mm: float = 2.0
+    self_clearance_mm: float = 2.0  # between bodies of one arm that are not neighbours, and what it carries
+    block_clearance_mm: float = 1.0  # between an empty hand and the block or its pin
+    lift_mm: float = 40.0  # how high the block travels above the pick height, far from both ends
+    lift_scale_mm: float = 25.0  # how fast, in horizontal distance from an end, that height is asked for
+    approach_scale_mm: float = 10.0  # the same for an empty hand that comes to the pin or leaves it
+    control_points: int = 9  # of each path's spline
+    degree: int = 5
+    starts: int = 16  # first guesses tried at most
+    velocity_share: float = 0.8  # of the URDF's joint velocities
+    acceleration_deg_s2: float = 800.0
+    sample_s: float = 0.02  # a timed trajectory is written at this interval
+    finger_travel_mm: float = 12.0  # how far each finger opens before it closes on the pin
+    grasp_s: float = 0.4  # closing the fingers
+    release_s: float = 0.3  # opening them
+
+
+@dataclass
 class TaskChanges:
     """What to put over a policy's own task; None leaves a setting as the policy brought it."""
 
