@@ -110,7 +110,7 @@ class MotionConfig:
     self_clearance_mm: float = 2.0  # between bodies of one arm that are not neighbours, and what it carries
     block_clearance_mm: float = 1.0  # between an empty hand and the block or its pin
     lift_mm: float = 40.0  # how high the block travels above the pick height, far from both ends
-    lift_scale_mm: float = 25.0  # how fast, in horizontal distance from an end, that height is asked for
+    lift_scale_mm: float = 25.0  # how fast, in horizontal distance from an end, that height is asked for; shorter ways: all in scale
     approach_scale_mm: float = 10.0  # the same for an empty hand that comes to the pin or leaves it
     control_points: int = 9  # of each path's spline
     degree: int = 5
@@ -167,3 +167,18 @@ def require_between(name: str, value: float, low: float, high: float) -> None:
     """Raise :class:`InvalidSetting` unless ``low <= value <= high``."""
     if not (math.isfinite(value) and low <= value <= high):
         raise InvalidSetting(name, value, f"between {low:g} and {high:g}")
+
+
+@dataclass
+class LoopConfig:
+    """The closed loop on arms that are not exact."""
+
+    transfers: int = 30  # allowed an episode, picking up again after a miss included
+    chart_inset: float = 0.95  # hand-overs keep to this part of the chart, or to the cell's own part if that is smaller
+    edge_mm: float = 1.0  # an object this far outside all reach is taken for one at the edge: the fingers close on its pin all the same
+
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` on a value out of its limits."""
+        require_at_least("loop.transfers", self.transfers, 1)
+        require_between("loop.chart_inset", self.chart_inset, 0.1, 1)
+        require_between("loop.edge_mm", self.edge_mm, 0, 5)

@@ -24,6 +24,7 @@ from marl_handover.arrays import select
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import CellConfig, NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.errors import CheckpointMismatch, CorruptFile, MissingFile, UnknownChoice
+from marl_handover.motion.cost import motion_cost
 from marl_handover.resources import package_path
 from marl_handover.task.observations import ARM_FIELDS, ODD_FIELDS, observation_size, observe
 from marl_handover.task.planner import ExactPlanner
@@ -199,13 +200,13 @@ def load(name: str, cell: Cell | None = None, task: TaskConfig | None = None, se
         UnknownChoice, MissingFile, CorruptFile, CheckpointMismatch: if there is no such policy or its file is not whole.
     """
     if name in ("exact", "random", "greedy"):
-        rules = Rules(cell or load_cell(), task or TaskConfig())
+        rules = _rules(cell or load_cell(), task or TaskConfig())
         made = {"exact": ExactPolicy, "greedy": GreedyPolicy}
         return RandomPolicy(rules, seed) if name == "random" else made[name](rules)
     arrays = _arrays(name)
     about = json.loads(str(arrays["about"]))
     own_cell, own_task = stored_settings(about)
-    return NetworkPolicy(Rules(cell or load_cell(own_cell), task or own_task), name, arrays, about)
+    return NetworkPolicy(_rules(cell or load_cell(own_cell), task or own_task), name, arrays, about)
 
 
 def adapted(name: str, cell: CellConfig | None = None, seed: int = 0, **changes: Any) -> SupervisorPolicy:
@@ -226,7 +227,12 @@ def adapted(name: str, cell: CellConfig | None = None, seed: int = 0, **changes:
     trained = own.rules.config.architecture
     if isinstance(own, NetworkPolicy) and settings.architecture != trained:
         raise CheckpointMismatch(name, "architecture", trained, settings.architecture)
-    return own.under(Rules(own.rules.cell if cell is None else load_cell(cell), settings))
+    return own.under(_rules(own.rules.cell if cell is None else load_cell(cell), settings))
+
+
+def _rules(cell: Cell, task: TaskConfig) -> Rules:
+    """The rule book that training used too."""
+    return Rules(cell, task, motion_cost(cell, task))
 
 
 def stored_settings(about: Mapping[str, Any]) -> tuple[CellConfig, TaskConfig]:

@@ -32,7 +32,7 @@ def ground_clearance_mm(arm: ArmModel, q: ArrayLike) -> Floats:
     Negative below the table. The base and the turret stand on the table and do not count.
     """
     frames = arm.link_transforms(q)
-    bodies = _body_of_links(arm.description)
+    bodies = joints_before(arm.description)
     first = ARM_JOINTS.index("shoulder") + 1
     heights = [
         _lowest_mm(frames[link.name], shape) for link in arm.description.links if bodies[link.name] >= first for shape in link.collisions
@@ -47,7 +47,7 @@ def self_clearance_mm(arm: ArmModel, q: ArrayLike) -> Floats:
 
     Negative where capsules overlap. Links between which no arm joint lies are one body: fixed links, and the fingers (open) with the hand.
     """
-    capsules, first, second = _capsule_pairs(arm.description)
+    capsules, first, second = capsule_pairs(arm.description)
     if not len(first):
         return np.full(np.shape(q)[:-1], np.inf)
     frames = arm.link_transforms(q)
@@ -120,7 +120,7 @@ def _lowest_mm(T_base_link: Floats, shape: Primitive) -> Floats:
 
 
 @lru_cache(maxsize=8)
-def _body_of_links(description: ArmDescription) -> dict[str, int]:
+def joints_before(description: ArmDescription) -> dict[str, int]:
     """Link name -> number of arm joints between it and the base."""
     bodies = {description.root: 0}
     for joint in description.joints:
@@ -129,9 +129,9 @@ def _body_of_links(description: ArmDescription) -> dict[str, int]:
 
 
 @lru_cache(maxsize=8)
-def _capsule_pairs(description: ArmDescription) -> tuple[tuple[Capsule, ...], tuple[int, ...], tuple[int, ...]]:
+def capsule_pairs(description: ArmDescription) -> tuple[tuple[Capsule, ...], tuple[int, ...], tuple[int, ...]]:
     """All capsules, and the indices of the pairs that belong to bodies which are not neighbours."""
-    bodies = _body_of_links(description)
+    bodies = joints_before(description)
     capsules = tuple(enclosing_capsule(link.name, shape) for link in description.links for shape in link.collisions)
     order = [bodies[capsule.link] for capsule in capsules]
     pairs = [(i, j) for i in range(len(order)) for j in range(i + 1, len(order)) if abs(order[i] - order[j]) > 1]

@@ -16,6 +16,7 @@ from marl_handover.arrays import wrap
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import TaskConfig
 from marl_handover.errors import NotFinite, OutOfReach
+from marl_handover.motion.cost import motion_cost
 from marl_handover.task.observations import observation_size, observe
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules
@@ -43,7 +44,7 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
     def __init__(self, architecture: str = "B", cell: Cell | None = None, task: TaskConfig | None = None, render_mode: None = None) -> None:
         cell = cell or load_cell()
         task = replace(task or TaskConfig(layout="object"), architecture=architecture)
-        self.rules = Rules(cell, task)
+        self.rules = Rules(cell, task, motion_cost(cell, task))
         self.render_mode = render_mode
         reach = float(max(abs(base.x_mm) for base in cell.bases) + cell.r_max_mm + 1.0)
         reach_y = float(max(abs(base.y_mm) for base in cell.bases) + cell.r_max_mm + 1.0)

@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import TaskConfig, require_at_least, require_positive
+from marl_handover.motion.cost import motion_cost
 from marl_handover.task.observations import observation_size, observe
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules
@@ -45,8 +46,8 @@ class SupervisorEnv(EnvBase):
     ) -> None:
         require_at_least("num_envs", num_envs, 1)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
-        cell = cell or load_cell()
-        self.rules = Rules(cell, task or TaskConfig())
+        cell, task = cell or load_cell(), task or TaskConfig()
+        self.rules = Rules(cell, task, motion_cost(cell, task))
         self.generator = torch.Generator(device=self.device)
         self.epsilon_range_rad = (self.rules.epsilon_rad, self.rules.epsilon_rad)
         self._make_specs()

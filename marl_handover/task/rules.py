@@ -18,7 +18,6 @@ from marl_handover.config import TaskConfig
 MotionCost = Callable[[Cell, Array, Array, Array], Array]
 """Cost in mm, shape (...), of a transfer: cell, arm (...), from_mm (..., 2), to_mm (..., 2). Eq. (3) of the paper."""
 
-
 ROUNDING_RAD = 1e-5
 """An orientation that was foreseen within epsilon does not fail by float32 rounding."""
 
@@ -61,6 +60,13 @@ class Finishing(NamedTuple):
     turn_rad: Array
 
 
+class External(NamedTuple):
+    """Architecture A's final transfer: ``arm`` int (...), -1 where none can finish; ``pose`` (..., 3), where the object is to be then."""
+
+    arm: Array
+    pose: Array
+
+
 class Transition(NamedTuple):
     """Result of one decision.
 
@@ -87,16 +93,27 @@ def straight_line_mm(cell: Cell, arm: Array, start_mm: Array, end_mm: Array) -> 
     return xp.sqrt(((end_mm - start_mm) ** 2).sum(-1))
 
 
-class Rules:
-    """The decision problem of one cell (method section 3)."""
+def carried(pose: Array, target_mm: Array, turn_rad: Array) -> Array:
+    """Pose (..., 3) of an object taken from ``pose`` to ``target_mm`` (..., 2) by a gripper that turns by ``turn_rad`` (...) on the way."""
+    return namespace(pose).concat([target_mm, wrap(pose[..., 2] + turn_rad)[..., None]], -1)
 
-    def __init__(self, cell: Cell, config: TaskConfig, motion_cost: MotionCost = straight_line_mm) -> None:
+
+class Rules:
+    """The decision problem of one cell (method section 3).
+
+    :meth:`step` is a decision from end to end. Who executes transfers elsewhere composes it from the same pieces: :meth:`decode`,
+    :meth:`transfer`, then :meth:`judge` (architecture B) or :meth:`external` and :meth:`external_verdict` (A).
+    ``physical`` says that placements are measured, though the task's settings have no noise.
+    """
+
+    def __init__(self, cell: Cell, config: TaskConfig, motion_cost: MotionCost = straight_line_mm, *, physical: bool = False) -> None:
         config.validate()
         self.cell = cell
         self.config = config
         self.motion_cost = motion_cost
         self.epsilon_rad = math.radians(config.epsilon_deg)
         self.noisy = config.noise.position_mm > 0 or config.noise.yaw_deg > 0
+        self.measured = self.noisy or physical
 
     @property
     def external_finish(self) -> bool:
@@ -140,15 +157,13 @@ class Rules:
 
         theta' = theta + psi_b(p') - psi_b(p). A refused transfer leaves the object where it is.
         """
-        xp = namespace(pose)
         square, yaw = self.cell.polar(pose)
         target = one_where(command.final, goal[..., :2], command.place_mm)
         target_square, target_yaw = self.cell.polar(target)
         feasible = self.cell.within(select(square, command.arm), select(yaw, command.arm)) & self.cell.within(
             select(target_square, command.arm), select(target_yaw, command.arm)
         )
-        turn = select(target_yaw - yaw, command.arm)
-        moved = xp.concat([target, wrap(pose[..., 2] + turn)[..., None]], -1)
+        moved = carried(pose, target, select(target_yaw - yaw, command.arm))
         return one_where(feasible, moved, pose), feasible
 
     def judge(self, placed: Array, goal: Array, final: Array, feasible: Array, epsilon_rad: Array | float | None = None) -> Verdict:
@@ -182,7 +197,32 @@ class Rules:
     @property
     def tolerance_mm(self) -> float:
         """How far from the goal position a final placement may land: 1 um on exact hardware, else the setting."""
-        return self.config.position_tolerance_mm if self.noisy else REACH_TOLERANCE_MM
+        return self.config.position_tolerance_mm if self.measured else REACH_TOLERANCE_MM
+
+    def external(self, pose: Array, goal: Array, room: Array | bool = True, epsilon_rad: Array | float | None = None) -> External:
+        """Architecture A's choice for an object at ``pose``: the arm that finishes within epsilon, where there is ``room`` for it."""
+        xp = namespace(pose)
+        finishing = self.finishing(pose, goal, epsilon_rad)
+        solved = finishing.able.any(-1) & room
+        # The arm that leaves the smaller error: a rule that favours neither side keeps the mirror law.
+        error = abs(finishing.error_rad)
+        nearest = xp.argmin(xp.where(finishing.able, error, error + 2 * math.pi), -1)
+        final_pose = carried(pose, goal[..., :2], select(finishing.turn_rad, nearest))
+        return External(xp.where(solved, nearest, -1), one_where(solved, final_pose, pose))
+
+    def external_verdict(self, pose: Array, goal: Array, external_arm: Array, epsilon_rad: Array | float | None = None) -> Verdict:
+        """Reward r_A of a decision after which ``external_arm`` (-1: none) took the object and left it at ``pose``.
+
+        On exact hardware the final transfer does what was foreseen; otherwise it is what came of it that counts.
+        """
+        xp = namespace(pose)
+        solved, one = external_arm >= 0, xp.ones_like(pose[..., 0])
+        offset = xp.sqrt(((pose[..., :2] - goal[..., :2]) ** 2).sum(-1))
+        left = abs(self.orientation_error(pose[..., 2], goal[..., 2]))
+        there, turned = offset <= self.tolerance_mm, left <= self._epsilon(epsilon_rad, per_arm=False) + ROUNDING_RAD
+        missed = xp.where(there, int(Outcome.WRONG_ORIENTATION), int(Outcome.WRONG_POSITION))
+        outcome = xp.where(solved, xp.where(there & turned, int(Outcome.SUCCESS), missed), int(Outcome.NONE))
+        return Verdict(xp.where(solved & there & turned, 0 * one, -one), solved, outcome)
 
     def step(
         self,
@@ -236,31 +276,17 @@ class Rules:
         """Architecture A: an object that can be finished is finished; before the command, if it can be already then."""
         xp = namespace(pose)
         early = self.can_finish(pose, goal, epsilon_rad).any(-1)  # solved at the start: the action is ignored
-        placed = one_where(early, pose, placed)
-        feasible = feasible & ~early
+        placed, feasible = one_where(early, pose, placed), feasible & ~early
         room = True if transfers_left is None else (early | (transfers_left > 1))
-        finishing = self.finishing(placed, goal, epsilon_rad)
-        solved = finishing.able.any(-1) & room
-        # The arm that leaves the smaller error: a rule that favours neither side keeps the mirror law.
-        error = abs(finishing.error_rad)
-        nearest = xp.argmin(xp.where(finishing.able, error, error + 2 * math.pi), -1)
-        external_arm = xp.where(solved, nearest, -1)
-        final_theta = wrap(placed[..., 2] + select(finishing.turn_rad, nearest))
-        final_pose = xp.concat([goal[..., :2], final_theta[..., None]], -1)
+        external = self.external(placed, goal, room, epsilon_rad)
+        solved, final_pose = external.arm >= 0, external.pose
         if final_noise is not None:
-            final_pose = self._displaced(final_pose, final_noise)
-        after = xp.where(solved, external_arm, xp.where(feasible, command.arm, previous_arm))
+            final_pose = one_where(solved, self._displaced(final_pose, final_noise), final_pose)
+        after = xp.where(solved, external.arm, xp.where(feasible, command.arm, previous_arm))
         transfers = xp.where(early, 0, 1) + xp.where(solved, 1, 0)
-        # On exact hardware the final transfer does what was foreseen; otherwise it is what came of it that counts.
-        offset = xp.sqrt(((final_pose[..., :2] - goal[..., :2]) ** 2).sum(-1))
-        left = abs(self.orientation_error(final_pose[..., 2], goal[..., 2]))
-        there, turned = offset <= self.tolerance_mm, left <= self._epsilon(epsilon_rad, per_arm=False) + ROUNDING_RAD
-        missed = xp.where(there, int(Outcome.WRONG_ORIENTATION), int(Outcome.WRONG_POSITION))
-        outcome = xp.where(solved, xp.where(there & turned, int(Outcome.SUCCESS), missed), int(Outcome.NONE))
-        one = xp.ones_like(placed[..., 0])
-        reward = xp.where(solved & there & turned, 0 * one, -one) - self.motion_penalty(command.arm, pose, placed)
-        pose = one_where(solved, final_pose, placed)
-        return Transition(pose, after, placed, command, feasible, external_arm, transfers, reward, solved, outcome)
+        verdict = self.external_verdict(final_pose, goal, external.arm, epsilon_rad)
+        reward = verdict.reward - self.motion_penalty(command.arm, pose, placed)
+        return Transition(final_pose, after, placed, command, feasible, external.arm, transfers, reward, *verdict[1:])
 
     def _epsilon(self, epsilon_rad: Array | float | None, per_arm: bool = True) -> Array:
         if epsilon_rad is None:
@@ -270,6 +296,4 @@ class Rules:
         return epsilon_rad
 
     def _displaced(self, pose: Array, offset: Array) -> Array:
-        xp = namespace(pose)
-        moved = pose + offset
-        return xp.concat([moved[..., :2], wrap(moved[..., 2:])], -1)
+        return carried(pose, pose[..., :2] + offset[..., :2], offset[..., 2])

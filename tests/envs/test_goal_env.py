@@ -16,6 +16,7 @@ import marl_handover
 from marl_handover.config import NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.envs import SupervisorEnv, SupervisorGoalEnv
 from marl_handover.errors import NotFinite, OutOfReach
+from marl_handover.motion.cost import motion_cost
 from marl_handover.task.rules import Outcome
 
 architectures = pytest.mark.parametrize("architecture", ["A", "B"])
@@ -217,8 +218,13 @@ def test_an_environment_leaves_the_settings_it_was_given_alone():
 
 def test_the_motion_cost_is_recomputed_too():
     """With the coupled reward a step's reward is still the one that ``compute_reward`` gives from what a buffer stores."""
-    env = SupervisorGoalEnv("B", task=TaskConfig(layout="object", reward=RewardConfig(motion_weight=1.0)))
+    task = TaskConfig(layout="object", reward=RewardConfig(motion_weight=1.0))
+    env = SupervisorGoalEnv("B", task=task)
     env.reset(options={"state": [200.0, 180.0, 0.0], "goal": [-200.0, -180.0, 0.0]})
     after, reward, *_, info = env.step(np.array([-1, -1, 0, 0], np.float32))
-    assert reward == pytest.approx(-1 - math.hypot(200, 180) / 100)
+    length = motion_cost(env.rules.cell, task)(
+        env.rules.cell, np.int64(0), np.array([200.0, 180.0]), after["achieved_goal"][:2].astype(float)
+    )
+    assert length > math.hypot(200, 180)
+    assert reward == pytest.approx(-1 - length / 100)
     assert env.compute_reward(after["achieved_goal"], after["desired_goal"], info) == pytest.approx(reward)

@@ -1,0 +1,99 @@
+"""Observation and action spaces of the AEC environment, and observations in them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary
+from numpy.typing import NDArray
+
+from marl_handover.cell import CellModel
+from marl_handover.config import MotionConfig
+from marl_handover.motion.executor import ARM_AGENTS
+from marl_handover.task.rules import Rules
+
+Floats = NDArray[np.float64]
+
+SUPERVISOR = "supervisor"
+EDGE_MM = 1.0
+"""Positions are shown up to this far outside all reach, where no arm can do anything about them; what lies farther is shown there."""
+
+
+class Spaces:
+    """The spaces of one cell.
+
+    The supervisor observes ``state`` and ``goal`` (3,): x_mm, y_mm, theta_rad, ``previous_arm`` (0 none, 1 L, 2 R) and ``legal`` (4,): at
+    ``2 * arm + final`` whether that command can be carried out, which without ``final`` takes that the arm reaches the object, with it that
+    it reaches the goal as well; architecture A has no final commands. It acts with ``final``, ``arm`` and ``place``: alpha, beta.
+
+    An arm observes whether it is ``active``; the ``target`` (2,) it is to take the object to (the object's own place if it is not active),
+    world, mm; the ``object`` (3,); its ``joints`` (5,) and those of the others, ``other_joints``; and whether the transfer is ``final``. It
+    acts with ``paths`` (3, N, 5): control points in rad of approach, transfer and retreat; ``grasp`` and ``release``: 0 declines.
+    """
+
+    def __init__(self, model: CellModel, motion: MotionConfig) -> None:
+        cell, lower, upper = model.cell, model.arm.lower_rad, model.arm.upper_rad
+        self.num_arms, self.control_points = cell.num_arms, motion.control_points
+        reach = [max(abs(base.x_mm) for base in cell.bases), max(abs(base.y_mm) for base in cell.bases)]
+        high = np.array([*(value + cell.r_max_mm + EDGE_MM for value in reach), math.pi], np.float32)
+        self._high = high
+        self._lower, self._upper = lower.astype(np.float32), upper.astype(np.float32)
+        self.observation, self.action = {SUPERVISOR: self._supervisor_sees()}, {SUPERVISOR: self._supervisor_acts()}
+        for agent in ARM_AGENTS[: self.num_arms]:
+            self.observation[agent], self.action[agent] = self._arm_sees(), self._arm_acts()
+
+    def supervisor_sees(self, rules: Rules, pose: Floats, goal: Floats, previous_arm: Any) -> dict[str, Any]:
+        """The supervisor's observation; ``previous_arm`` is -1 for none."""
+        picks = rules.cell.reaches(pose)
+        places = picks & rules.cell.reaches(goal) & (not rules.external_finish)
+        return {
+            "state": self._shown(pose),
+            "goal": self._shown(goal),
+            "previous_arm": np.int64(previous_arm + 1),
+            "legal": np.stack([picks, places], -1).reshape(-1).astype(np.int8),
+        }
+
+    def arm_sees(self, arm: int, active: bool, target_mm: Floats, final: bool, pose: Floats, joints_rad: Floats) -> dict[str, Any]:
+        """An arm's observation; ``joints_rad`` (num_arms, 5) are those of all arms."""
+        joints = np.clip(joints_rad.astype(np.float32), self._lower, self._upper)
+        return {
+            "active": np.int64(active),
+            "target": self._shown(target_mm),
+            "object": self._shown(pose),
+            "joints": joints[arm],
+            "other_joints": np.delete(joints, arm, 0).reshape(-1),
+            "final": np.int64(final),
+        }
+
+    def _shown(self, pose: Floats) -> NDArray[np.float32]:
+        high = self._high[: len(pose)]
+        return np.clip(pose.astype(np.float32), -high, high)
+
+    def _supervisor_sees(self) -> Dict:
+        return Dict(
+            state=Box(-self._high, self._high),
+            goal=Box(-self._high, self._high),
+            previous_arm=Discrete(self.num_arms + 1),
+            legal=MultiBinary(2 * self.num_arms),
+        )
+
+    def _supervisor_acts(self) -> Dict:
+        return Dict(final=Discrete(2), arm=Discrete(self.num_arms), place=Box(-1.0, 1.0, (2,)))
+
+    def _arm_sees(self) -> Dict:
+        others = self.num_arms - 1
+        return Dict(
+            active=Discrete(2),
+            target=Box(-self._high[:2], self._high[:2]),
+            object=Box(-self._high, self._high),
+            joints=Box(self._lower, self._upper),
+            other_joints=Box(np.tile(self._lower, others), np.tile(self._upper, others)),
+            final=Discrete(2),
+        )
+
+    def _arm_acts(self) -> Dict:
+        shape = (3, self.control_points, len(self._lower))
+        paths = Box(np.broadcast_to(self._lower, shape), np.broadcast_to(self._upper, shape))
+        return Dict(paths=paths, grasp=Discrete(2), release=Discrete(2))

@@ -1,0 +1,185 @@
+"""An arm and what is around it as packed arrays for the kernels: capsules, self pairs, obstacles, the held block."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover.cell.build import CellModel
+from marl_handover.cell.collision import Capsule, capsule_pairs, joints_before
+from marl_handover.cell.kinematics import ArmModel
+from marl_handover.config import BlockConfig, MotionConfig
+from marl_handover.motion.kernels import can_meet
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MARGIN_MM = 3.0
+"""The optimiser asks for up to this much more clearance than is demanded; pairs that never come so near are left out."""
+
+GRID_RAD = math.radians(4.0)
+
+SPOKES = 3
+"""The block's footprint, whatever its orientation, is covered by this many capsules through its centre."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArmBody:
+    """The packed shapes of one arm, bare and holding the block; layouts as in :mod:`marl_handover.motion.kernels`.
+
+    ``pairs`` index capsules that must not touch and might, within the joint ``limits`` (4, 2); the others are proved apart. ``edges``
+    (2, 2) are the held block's lower front and rear edge in the wrist's frame. ``reach_mm``: nothing of the arm, or held by it, is ever
+    farther from the yaw axis.
+    """
+
+    planar: Floats
+    capsules: Floats
+    pairs: Ints
+    held: Floats
+    held_pairs: Ints
+    edges: Floats
+    limits: Floats
+    reach_mm: float
+
+
+def arm_body(model: CellModel, motion: MotionConfig) -> ArmBody:
+    """The shapes of a cell's arm, its fingers opened by ``finger_travel_mm``."""
+    arm = model.arm
+    planar = np.concatenate([arm.shoulder_mm, arm.upper_arm_mm, arm.forearm_mm, arm.tool_mm])
+    shapes, first, second = capsule_pairs(arm.description)
+    pivots = np.array([[0.0, 0.0], [0.0, 0.0], arm.shoulder_mm, arm.shoulder_mm + arm.upper_arm_mm])
+    pivots = np.concatenate([pivots, [pivots[3] + arm.forearm_mm]])
+    frames = arm.link_transforms(np.zeros(5), motion.finger_travel_mm)
+    before = joints_before(arm.description)
+    rows = []
+    for shape in shapes:
+        level = min(before[shape.link], 4)
+        T_base_link = frames[shape.link]
+        ends = [T_base_link[:3, :3] @ np.array(end) + T_base_link[:3, 3] for end in (shape.start_mm, shape.end_mm)]
+        offset = np.array([pivots[level][0], 0.0, pivots[level][1]])
+        rows.append([level, *(ends[0] - offset), *(ends[1] - offset), shape.radius_mm])
+    shaped = _with_half_lengths(rows, 1)
+    order = np.argsort([row[0] for row in rows], kind="stable")
+    rank = np.argsort(order)
+    capsules = shaped[order]
+    pairs = np.array(sorted((rank[i], rank[j]) for i, j in zip(first, second, strict=True)), np.int64).reshape(-1, 2)
+    tool = arm.tool_mm
+    grip_to_table = model.cell.config.pick_height_mm
+    block = [
+        [4.0, *_shifted(shape.start_mm, tool), *_shifted(shape.end_mm, tool), shape.radius_mm]
+        for shape in block_capsules(model.cell.config.block, grip_to_table)
+    ]
+    held = np.concatenate([capsules, _with_half_lengths(block, 1)])
+    # The held block moves with the hand; it may meet everything up to the forearm.
+    with_held = [(k, len(capsules) + j) for k in range(len(capsules)) if capsules[k, 0] <= 3 for j in range(len(block))]
+    half = model.cell.config.block.side_mm / 2 * math.sqrt(2)
+    edges = np.array([[tool[0] + side * half, tool[1] - grip_to_table] for side in (-1.0, 1.0)])
+    limits = np.stack([arm.lower_rad[:4], arm.upper_rad[:4]], axis=1)
+    all_pairs = np.concatenate([pairs, np.array(with_held, np.int64)])
+    need = motion.self_clearance_mm + MARGIN_MM
+    steps = np.maximum(np.ceil((limits[1:, 1] - limits[1:, 0]) / GRID_RAD), 2).astype(np.int64)
+    meeting = [can_meet(planar, held, a, b, held[a, 7] + held[b, 7] + need, limits, steps) for a, b in all_pairs]
+    all_pairs = all_pairs[np.array(meeting)]
+    fixed, hand = held[held[:, 0] < 2], held[held[:, 0] >= 4]
+    grouped = (held[all_pairs[:, 0], 0] < 2) & (held[all_pairs[:, 1], 0] >= 4)
+    all_pairs = np.concatenate([all_pairs[grouped], all_pairs[~grouped]])  # the kernels skip the first ones together
+    planar = np.concatenate([planar, _planar_ball(fixed), _planar_ball(hand)])
+    return ArmBody(
+        planar, capsules, all_pairs[all_pairs.max(axis=1) < len(capsules)], held, all_pairs, edges, limits, _reach_mm(planar, held, limits)
+    )
+
+
+def block_capsules(block: BlockConfig, grip_to_table_mm: float) -> list[Capsule]:
+    """Capsules around the block and its pin in a frame at the grip, z up; they hold for every orientation of the block about the pin."""
+    half_side, half_height = block.side_mm / 2, block.height_mm / 2
+    corner = half_side * math.sqrt(2)
+    turn = math.pi / (2 * SPOKES)
+    radius = math.hypot(corner * math.sin(turn), half_height)
+    reach = corner * math.cos(turn)
+    centre = half_height - grip_to_table_mm
+    shapes = []
+    for spoke in range(SPOKES):
+        x, y = reach * math.cos(spoke * math.pi / SPOKES), reach * math.sin(spoke * math.pi / SPOKES)
+        shapes.append(Capsule("block", (-x, -y, centre), (x, y, centre), radius))
+    pin = block.pin_diameter_mm / 2
+    bottom, top = block.height_mm - grip_to_table_mm, block.pin_top_mm - grip_to_table_mm - pin
+    return [*shapes, Capsule("pin", (0.0, 0.0, bottom), (0.0, 0.0, top), pin)]
+
+
+def standing_arm(arm: ArmModel, motion: MotionConfig, q: Floats, T_arm_other: Floats) -> Floats:
+    """Obstacle rows (M, 9) of another arm of the same kind that holds still at ``q`` (5,), in the frame of the moving arm's base."""
+    frames = arm.link_transforms(q, motion.finger_travel_mm)
+    rows = []
+    for shape in capsule_pairs(arm.description)[0]:
+        T = T_arm_other @ frames[shape.link]
+        ends = [T[:3, :3] @ np.array(end) + T[:3, 3] for end in (shape.start_mm, shape.end_mm)]
+        rows.append([*ends[0], *ends[1], shape.radius_mm, motion.arm_clearance_mm])
+    return _with_half_lengths(rows, 0)
+
+
+def standing_block(model: CellModel, motion: MotionConfig, place_mm: Floats) -> Floats:
+    """Obstacle rows of the block standing at ``place_mm`` (2,) of the moving arm's base frame."""
+    height = model.cell.config.pick_height_mm
+    at = np.array([place_mm[0], place_mm[1], height])
+    shapes = block_capsules(model.cell.config.block, height)
+    rows = [[*(at + shape.start_mm), *(at + shape.end_mm), shape.radius_mm, motion.block_clearance_mm] for shape in shapes]
+    return _with_half_lengths(rows, 0)
+
+
+def ball_around(obstacles: Floats) -> Floats:
+    """A ball (x, y, z, radius) in mm around obstacle rows, and the greatest clearance they demand: (5,)."""
+    if not len(obstacles):
+        return np.zeros(5)
+    points = obstacles[:, :6].reshape(-1, 3)
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    away = np.linalg.norm(obstacles[:, :6].reshape(-1, 2, 3) - centre, axis=-1).max(axis=1) + obstacles[:, 6]
+    return np.array([*centre, away.max(), obstacles[:, 7].max()])
+
+
+def _shifted(point_mm: tuple[float, float, float], tool_mm: Floats) -> tuple[float, float, float]:
+    """A point of the grip's frame in the wrist's."""
+    return point_mm[0] + tool_mm[0], point_mm[1], point_mm[2] + tool_mm[1]
+
+
+def _planar_ball(capsules: Floats) -> Floats:
+    """A ball (r, z, radius) around capsules of one frame, its centre in the arm's plane."""
+    points = capsules[:, 1:7].reshape(-1, 3)
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    centre[1] = 0.0
+    away = np.linalg.norm(capsules[:, 1:7].reshape(-1, 2, 3) - centre, axis=-1).max(axis=1) + capsules[:, 7]
+    return np.array([centre[0], centre[2], away.max()])
+
+
+def out_of_reach(body: ArmBody, obstacles: Floats) -> NDArray[np.bool_]:
+    """Which obstacle rows (M,) the arm cannot come near to in any posture, whatever it holds: those are proved clear."""
+    if not len(obstacles):
+        return np.zeros(0, bool)
+    points = obstacles[:, :6].reshape(-1, 2, 3)
+    # The nearest a segment comes to the yaw axis is at least its nearer end's distance less its length.
+    nearer = np.hypot(points[..., 0], points[..., 1]).min(axis=1) - np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
+    return np.asarray(nearer - obstacles[:, 6] - obstacles[:, 7] - MARGIN_MM > body.reach_mm)
+
+
+def _reach_mm(planar: Floats, held: Floats, limits: Floats) -> float:
+    """A bound on how far from the yaw axis any part of the arm, or of what it holds, can be."""
+    upper, forearm = math.hypot(planar[2], planar[3]), math.hypot(planar[4], planar[5])
+    # The wrist is farthest from the shoulder where the elbow is least bent.
+    angle = math.atan2(planar[5], planar[4]) - math.atan2(planar[3], planar[2])
+    low, high = limits[2] + angle
+    bend = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
+    wrist = math.sqrt(upper**2 + forearm**2 + 2 * upper * forearm * math.cos(min(bend, math.pi)))
+    at_wrist = held[held[:, 0] >= 4]
+    hand = (np.linalg.norm(at_wrist[:, 1:7].reshape(-1, 2, 3), axis=-1).max(axis=1) + at_wrist[:, 7]).max()
+    before = held[held[:, 0] < 4]
+    arm = (np.linalg.norm(before[:, 1:7].reshape(-1, 2, 3), axis=-1).max(axis=1) + before[:, 7]).max()
+    return float(abs(planar[0]) + max(wrist + hand, upper + arm, arm))
+
+
+def _with_half_lengths(rows: list[list[float]], first: int) -> Floats:
+    """Rows with the half length of their segment, whose points start at column ``first``, put at the end."""
+    array = np.array(rows, dtype=float)
+    halves = np.linalg.norm(array[:, first + 3 : first + 6] - array[:, first : first + 3], axis=1) / 2
+    return np.concatenate([array, halves[:, None]], axis=1)

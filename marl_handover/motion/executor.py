@@ -1,0 +1,106 @@
+"""The agent that plays an arm: it turns what the arm is asked for into the control points of a whole cycle, or declines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover.cell import CellModel, build_cell, cell_config
+from marl_handover.cell.spaces import points_in_base
+from marl_handover.config import CellConfig, MotionConfig, require_choice
+from marl_handover.errors import HandoverError, WorkFailed
+from marl_handover.motion.trajectory import CyclePaths
+
+if TYPE_CHECKING:
+    from marl_handover.motion.planner import MotionPlanner
+
+Floats = NDArray[np.float64]
+
+ARM_AGENTS = ("arm_left", "arm_right")
+"""Names of the arms' agents, by arm index."""
+
+METHODS = ("optimised", "direct")
+
+ROLL_RAD = 0.02
+"""The planner starts from wrist roll 0; a measured roll up to this is taken for it."""
+
+EDGE_RAD = 1e-4
+"""A pose at the edge of the annulus may need a joint this far past its limit; the joint stays at it, the grip is some 20 um off."""
+
+
+class CannotReach(WorkFailed):
+    """No joint vector within the limits puts the level grip where it should be."""
+
+    def __init__(self, agent: str, position_mm: Floats) -> None:
+        super().__init__(f"{agent} cannot reach ({position_mm[0]:.1f}, {position_mm[1]:.1f}) mm with the hand level at the pick height")
+        self.agent, self.position_mm = agent, position_mm
+
+
+class ExecutorAgent:
+    """Plays one arm of the AEC environment.
+
+    ``last_refusal`` says why the last call of :meth:`act` declined; None if it did not.
+
+    Args:
+        agent: ``"arm_left"`` or ``"arm_right"``.
+        cell: a shipped cell's name, a YAML path, settings, or a cell that is built already.
+        method: ``"optimised"``: collision-free shortest paths; ``"direct"``: straight lines in joint space between the ends, which may
+            touch anything, for kinematic backends.
+        motion: how the arms move; the environment's own has to be the same.
+    """
+
+    def __init__(
+        self, agent: str, cell: str | CellConfig | CellModel = "paper", method: str = "optimised", motion: MotionConfig | None = None
+    ) -> None:
+        require_choice("agent", agent, ARM_AGENTS)
+        require_choice("method", method, METHODS)
+        self.agent, self.method, self.motion = agent, method, motion or MotionConfig()
+        self.arm = ARM_AGENTS.index(agent)
+        self.model = cell if isinstance(cell, CellModel) else build_cell(cell_config(cell) if isinstance(cell, str) else cell)
+        self.last_refusal: str | None = None
+        self._planner: MotionPlanner | None = None
+
+    def act(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        """The arm's action: ``paths`` float32 (3, N, 5) in rad, and ``grasp`` and ``release``, both 0 where no cycle was found."""
+        joints, others = np.asarray(observation["joints"], float), np.asarray(observation["other_joints"], float)
+        pick, place = np.asarray(observation["object"], float)[:2], np.asarray(observation["target"], float)
+        planner = self._made_planner() if self.method == "optimised" else None
+        try:
+            paths = self._direct(pick, place, joints) if planner is None else self._optimised(planner, pick, place, joints, others)
+            self.last_refusal = None
+        except HandoverError as failure:
+            self.last_refusal = str(failure)
+            paths = CyclePaths(*(np.tile(joints, (self.motion.control_points, 1)) for _ in range(3)))
+        lower, upper = self.model.arm.lower_rad.astype(np.float32), self.model.arm.upper_rad.astype(np.float32)
+        willing = np.int64(self.last_refusal is None)
+        return {"paths": np.clip(np.stack(paths).astype(np.float32), lower, upper), "grasp": willing, "release": willing}
+
+    def _direct(self, pick_mm: Floats, place_mm: Floats, joints_rad: Floats) -> CyclePaths:
+        ends = joints_rad, self._level(pick_mm), self._level(place_mm), np.radians(self.motion.parked_deg)
+        return CyclePaths(*(np.linspace(start, end, self.motion.control_points) for start, end in pairwise(ends)))
+
+    def _made_planner(self) -> MotionPlanner:
+        if self._planner is None:
+            from marl_handover.motion.planner import MotionPlanner  # compiles, or loads what was compiled before
+
+            self._planner = MotionPlanner(self.model, self.motion)
+        return self._planner
+
+    def _optimised(self, planner: MotionPlanner, pick_mm: Floats, place_mm: Floats, joints_rad: Floats, others_rad: Floats) -> CyclePaths:
+        joints = joints_rad.copy()
+        joints[4] = joints[4] if abs(joints[4]) > ROLL_RAD else 0.0
+        return planner.cycle(self.arm, pick_mm, place_mm, joints, others_rad).paths
+
+    def _level(self, position_mm: Floats) -> Floats:
+        """Joints (5,) of the level grip at a place (2,) of the table, at the pick height."""
+        base, arm = self.model.cell.bases[self.arm], self.model.arm
+        x, y = points_in_base(position_mm, (base.x_mm, base.y_mm, base.facing_rad))
+        joints = arm.ik([x, y, self.model.cell.config.pick_height_mm])[0]
+        inside = np.clip(joints, arm.lower_rad, arm.upper_rad)
+        if not (abs(joints - inside) <= EDGE_RAD).all():
+            raise CannotReach(self.agent, position_mm)
+        return inside

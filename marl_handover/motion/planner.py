@@ -1,0 +1,233 @@
+"""From a command to a motion: the three paths of a cycle, collision-free, and their timing."""
+
+from __future__ import annotations
+
+import math
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_handover.cell.build import CellModel
+from marl_handover.cell.spaces import points_in_base
+from marl_handover.config import MotionConfig, require_at_least, require_between, require_positive
+from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed
+from marl_handover.motion.body import arm_body, ball_around, standing_arm, standing_block
+from marl_handover.motion.scene import Scene
+from marl_handover.motion.segment import FoundPath, Segment, find_path
+from marl_handover.motion.starts import carrying_starts, reaching_starts
+from marl_handover.motion.trajectory import CyclePaths, TransferMotion
+
+Floats = NDArray[np.float64]
+
+EDGE_RAD = 1e-4
+"""A pose at the very edge may need a joint this far past its limit; the joint stays at the limit, the grip is some 20 um off."""
+
+NOTICE_S = 1.5
+STILL_MM = 1e-3
+"""A transfer shorter than this is none."""
+
+
+class OutOfArmsReach(WorkFailed):
+    """A command names a place outside the arm's own manipulation space."""
+
+    def __init__(self, arm: int, what: str, position_mm: Floats) -> None:
+        self.arm, self.what, self.position_mm = arm, what, position_mm
+        super().__init__(f"arm {arm} cannot {what} at ({position_mm[0]:.1f}, {position_mm[1]:.1f}) mm: outside its manipulation space")
+
+
+class MotionPlanner:
+    """Plans the motions of a cell's arms.
+
+    Args:
+        model: the cell.
+        motion: clearances, lift and limits.
+
+    Raises:
+        InvalidSetting: on a setting out of its limits, or a parked pose the arm cannot take.
+    """
+
+    def __init__(self, model: CellModel, motion: MotionConfig | None = None) -> None:
+        self.model, self.motion = model, motion or MotionConfig()
+        validate(self.motion)
+        self.parked_rad = np.radians(np.asarray(self.motion.parked_deg, float))
+        if self.parked_rad.shape != (5,) or not model.arm.within_limits(self.parked_rad):
+            raise InvalidSetting("motion.parked_deg", self.motion.parked_deg, "five angles within the joint limits")
+        self.body = arm_body(model, self.motion)
+        self.clearance_mm = np.array([self.motion.self_clearance_mm, self.motion.ground_clearance_mm])
+        self._standing: tuple[tuple[int, bytes], Floats] = ((-1, b""), np.zeros((0, 9)))  # the last one asked for
+        self.pick_height_mm = float(model.cell.config.pick_height_mm)
+
+    def cycle(
+        self, arm: int, pick_mm: ArrayLike, place_mm: ArrayLike, joints_rad: ArrayLike, other_joints_rad: ArrayLike
+    ) -> TransferMotion:
+        """Everything of one transfer, planned, checked and timed.
+
+        Args:
+            arm: index.
+            pick_mm: (2,) world position of the pin.
+            place_mm: (2,) where it goes.
+            joints_rad: (5,) where the arm is now; it ends parked.
+            other_joints_rad: (5,) where the other arm holds still.
+
+        Raises:
+            OutOfArmsReach, NoPath, NotFinite: why there is no such motion.
+        """
+        from marl_handover.motion.cycle import timed_phases
+
+        begun = time.perf_counter()
+        pick, place = (self._finite(name, value, 2) for name, value in (("pick_mm", pick_mm), ("place_mm", place_mm)))
+        joints, other = (
+            self._finite(name, value, 5) for name, value in (("joints_rad", joints_rad), ("other_joints_rad", other_joints_rad))
+        )
+        transfer = self.transfer(arm, pick, place, other)
+        approach = self.reach(arm, joints, pick, other, leaving=False)
+        retreat = self.reach(arm, self.parked_rad, place, other, leaving=True)
+        paths = CyclePaths(approach.points, transfer.points, retreat.points)
+        phases = timed_phases(paths, self.model.arm, self.motion, self.pick_height_mm)
+        clearance = min(found.margins.arm for found in (approach, transfer, retreat)) + self.motion.arm_clearance_mm
+        spent = 1e3 * (time.perf_counter() - begun)
+        return TransferMotion(arm, pick, place, paths, phases, other, transfer.length_mm, clearance, spent)
+
+    def warm_up(self) -> None:
+        """Plan and time one cycle, so that what is compiled on first use is; where that takes long, say so on stderr."""
+        notice = threading.Timer(NOTICE_S, print, ["compiling the motion kernels; once, they are cached ..."], {"file": sys.stderr})
+        notice.daemon = True
+        notice.start()
+        try:
+            cell = self.model.cell
+            radius = (cell.r_min_mm + cell.r_max_mm) / 2
+            base = cell.bases[0]
+            places = [base.facing_rad + turn for turn in (-0.3, 0.3)]
+            pick, place = ([base.x_mm + radius * math.cos(angle), base.y_mm + radius * math.sin(angle)] for angle in places)
+            self.cycle(0, pick, place, self.parked_rad, self.parked_rad)
+        finally:
+            notice.cancel()
+
+    def transfer(self, arm: int, pick_mm: Floats, place_mm: Floats, other_joints_rad: Floats) -> FoundPath:
+        """The path of the loaded hand from pick to place (world, mm). Raises as :meth:`cycle`."""
+        segment, guesses = self.carrying(arm, pick_mm, place_mm, other_joints_rad)
+        if math.dist(pick_mm, place_mm) < STILL_MM:
+            guesses = iter([np.repeat(segment.ends[:1], 33, axis=0)])
+        return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.starts)
+
+    def carrying(self, arm: int, pick_mm: Floats, place_mm: Floats, other_joints_rad: Floats) -> tuple[Segment, Iterator[Floats]]:
+        """The segment of a transfer and its first guesses."""
+        ends_mm = np.stack([self.in_base(arm, pick_mm), self.in_base(arm, place_mm)])
+        ends = np.stack([self.grasp_joints(arm, "pick up", pick_mm), self.grasp_joints(arm, "place", place_mm)])[:, :4]
+        distance = math.dist(*ends_mm)
+        # Over a short way the same profile is asked for, only smaller: it would be a spike otherwise.
+        share = min(1.0, max(distance, STILL_MM) / (2 * self.motion.lift_scale_mm))
+        scale, lift_mm = share * self.motion.lift_scale_mm, share * self.motion.lift_mm
+        profile = np.array([*ends_mm[0], *ends_mm[1], scale, scale, lift_mm, share * self.motion.ground_clearance_mm])
+        others = self._other(arm, other_joints_rad)
+        bound = string_length(distance, scale, lift_mm)
+        segment = Segment(self.body, self._scene(True, others, len(others), profile), ends, bound)
+        return segment, carrying_starts(self.body, ends, ends_mm, self.pick_height_mm, lift_mm)
+
+    def reach(self, arm: int, joints_rad: Floats, pin_mm: Floats, other_joints_rad: Floats, *, leaving: bool) -> FoundPath:
+        """The path of the empty hand from ``joints_rad`` to the pin, or, ``leaving``, from the pin to them. Raises as :meth:`cycle`."""
+        segment, guesses = self.reaching(arm, joints_rad, pin_mm, other_joints_rad, leaving=leaving)
+        return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.starts, wanted=1)
+
+    def reaching(
+        self, arm: int, joints_rad: Floats, pin_mm: Floats, other_joints_rad: Floats, *, leaving: bool
+    ) -> tuple[Segment, Iterator[Floats]]:
+        """The segment of :meth:`reach` and its first guesses."""
+        if abs(joints_rad[4]) > 1e-6 or not self.model.arm.within_limits(joints_rad):
+            raise InvalidSetting("joints_rad", np.round(joints_rad, 4).tolist(), "within the joint limits, with wrist roll 0")
+        pin = self.in_base(arm, pin_mm)
+        grasp = self.grasp_joints(arm, "place" if leaving else "pick up", pin_mm)
+        ends = np.stack([grasp, joints_rad] if leaving else [joints_rad, grasp])[:, :4]
+        scale = self.motion.approach_scale_mm
+        scales = (scale, 0.0) if leaving else (0.0, scale)
+        profile = np.array([*pin, *pin, *scales, self.motion.lift_mm, self.motion.ground_clearance_mm])
+        others = self._other(arm, other_joints_rad)
+        obstacles = np.concatenate([others, standing_block(self.model, self.motion, pin)])
+        segment = Segment(self.body, self._scene(False, obstacles, len(others), profile), ends, 0.0)
+        return segment, reaching_starts(self.body, ends, np.array([*pin, self.pick_height_mm]), self.motion.lift_mm, not leaving)
+
+    def grasp_joints(self, arm: int, what: str, position_mm: Floats) -> Floats:
+        """Joints (5,) that hold the pin at a world position (2,) with pitch = roll = 0. Raises :class:`OutOfArmsReach`."""
+        at = self.in_base(arm, position_mm)
+        q = self.model.arm.ik(np.array([*at, self.pick_height_mm]))
+        inside = np.clip(q, self.model.arm.lower_rad, self.model.arm.upper_rad)
+        good = (np.abs(q - inside) <= EDGE_RAD).all(axis=-1)  # NaN, out of reach, is not
+        if not good.any():
+            raise OutOfArmsReach(arm, what, position_mm)
+        return np.asarray(inside[int(np.argmax(good))])
+
+    def _scene(self, holding: bool, obstacles: Floats, arm_rows: int, profile: Floats) -> Scene:
+        """The arm, empty or with the block, among obstacles."""
+        body = self.body
+        capsules, pairs, edges = (body.held, body.held_pairs, body.edges) if holding else (body.capsules, body.pairs, body.edges[:0])
+        carried, group = len(body.capsules), ball_around(obstacles)
+        return Scene(
+            body.planar, capsules, carried, pairs, obstacles, arm_rows, group, self.clearance_mm, self.pick_height_mm, edges, profile
+        )
+
+    def in_base(self, arm: int, position_mm: Floats) -> Floats:
+        """A world position (2,) in the frame of an arm's base."""
+        base = self.model.cell.bases[arm]
+        return points_in_base(position_mm, (base.x_mm, base.y_mm, base.facing_rad))
+
+    def _other(self, arm: int, joints_rad: Floats) -> Floats:
+        """Obstacle rows of every other arm, all at the same joints."""
+        key = (arm, joints_rad.tobytes())
+        if self._standing[0] == key:
+            return self._standing[1]
+        bases = self.model.cell.bases
+        rows = []
+        for index, base in enumerate(bases):
+            if index == arm:
+                continue
+            turn = base.facing_rad - bases[arm].facing_rad
+            T = np.eye(4)
+            T[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+            T[:2, 3] = self.in_base(arm, np.array([base.x_mm, base.y_mm]))
+            rows.append(standing_arm(self.model.arm, self.motion, joints_rad, T))
+        self._standing = (key, np.concatenate(rows))
+        return self._standing[1]
+
+    @staticmethod
+    def _finite(name: str, value: ArrayLike, size: int) -> Floats:
+        array = np.asarray(value, dtype=float)
+        if array.shape != (size,):
+            raise InvalidSetting(name, np.shape(value), f"an array of shape ({size},)")
+        if not np.isfinite(array).all():
+            raise NotFinite(name, array.tolist())
+        return array
+
+
+@lru_cache(maxsize=4096)
+def string_length(distance_mm: float, scale_mm: float, lift_mm: float) -> float:
+    """Length in mm of a taut string over the lift-over profile, the arm left out: no transfer over ``distance_mm`` is shorter."""
+    s = np.linspace(0.0, distance_mm, 200)
+    z = lift_mm * (1 - np.exp(-((s / scale_mm) ** 2))) * (1 - np.exp(-(((distance_mm - s) / scale_mm) ** 2)))
+    hull: list[int] = []
+    for i in range(len(s)):
+        while len(hull) > 1 and _turns_left(s, z, hull[-2], hull[-1], i):
+            hull.pop()
+        hull.append(i)
+    return float(np.hypot(np.diff(s[hull]), np.diff(z[hull])).sum())
+
+
+def _turns_left(s: Floats, z: Floats, a: int, b: int, c: int) -> bool:
+    return bool((s[b] - s[a]) * (z[c] - z[a]) - (z[b] - z[a]) * (s[c] - s[a]) >= 0.0)
+
+
+def validate(motion: MotionConfig) -> None:
+    """Raise :class:`InvalidSetting` on a setting out of its limits."""
+    for name in ("arm_clearance_mm", "ground_clearance_mm", "self_clearance_mm", "block_clearance_mm", "lift_mm"):
+        require_at_least(f"motion.{name}", getattr(motion, name), 0)
+    for name in ("lift_scale_mm", "approach_scale_mm", "acceleration_deg_s2", "grasp_s", "release_s", "finger_travel_mm"):
+        require_positive(f"motion.{name}", getattr(motion, name))
+    require_between("motion.sample_s", motion.sample_s, 1e-3, 0.02)
+    require_between("motion.velocity_share", motion.velocity_share, 0.01, 1)
+    require_between("motion.degree", motion.degree, 3, 7)
+    require_between("motion.control_points", motion.control_points, motion.degree + 2, 25)
+    require_at_least("motion.starts", motion.starts, 1)

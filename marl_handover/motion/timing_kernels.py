@@ -1,0 +1,249 @@
+"""Compiled kernels of :mod:`marl_handover.motion.timing`, which says what they do together and where the method is from."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from marl_handover.motion.spline_kernels import STILL, dot, spline
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_WIDENING = 2.0  # grid intervals over which a tight turn is spread in s
+_LEAST = 0.01  # an x is not asked to fall to less than this part of the greatest in one interval; at 0 twice in a row nothing moves
+_FASTEST = 1e10  # (ds/dt)^2 where no limit binds, as on a piece that stands still: all of it in 10 us
+_SLOW = 1e-6  # a ds/dtau, 1 on the average, below which the path all but stands still and its acceleration is rounding
+_NEVER = 1e300  # half the width of a strip that does not bind
+_SETTLED = 1.003  # an excess over the limits that is not worth another pass
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _parameter_rates(nodes: Floats, first: Floats, second: Floats) -> Floats:
+    """ds/dtau (n, 3) at the beginning, middle and end of each interval, from dq/dtau and d2q/dtau2 (2n + 1, joints) there.
+
+    It is |dq/dtau|, but for tight turns: there it is made greater by the part of d2q/dtau2 across the path, so that they take longer in s.
+    """
+    n = nodes.shape[0] - 1
+    speed = np.empty(2 * n + 1)
+    greatest = 0.0
+    for j in range(2 * n + 1):
+        speed[j] = math.sqrt(dot(first, j, first, j))
+        greatest = max(greatest, speed[j])
+    for j in range(2 * n + 1):
+        if speed[j] > STILL * greatest:
+            across = dot(second, j, second, j) - (dot(first, j, second, j) / speed[j]) ** 2
+            speed[j] = math.sqrt(speed[j] ** 2 + max(across, 0.0) * (_WIDENING / n) ** 2)
+        else:
+            speed[j] = 0.0
+    rates = np.empty((n, 3))
+    total = 0.0
+    for i in range(n):
+        start, middle, end = speed[2 * i], max(speed[2 * i + 1], STILL * greatest), speed[2 * i + 2]
+        if 4.0 * middle < start + end - 2.0 * math.sqrt(start * end):  # the polynomial through the three would be negative somewhere
+            middle = 0.5 * (start + end)
+        rates[i, 0], rates[i, 1], rates[i, 2] = start, middle, end
+        total += (nodes[i + 1] - nodes[i]) * (start + 4.0 * middle + end) / 6.0
+    for i in range(n):
+        for place in range(3):
+            rates[i, place] /= total
+    return rates
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _within(rates: Floats, i: int, z: float) -> tuple[float, float, float]:
+    """At the part ``z`` of interval i, as if its width were 1: s from its beginning, ds/dz and d2s/dz2."""
+    start = rates[i, 0]
+    bend = 4.0 * rates[i, 1] - 3.0 * start - rates[i, 2]
+    curve = 2.0 * (start - 2.0 * rates[i, 1] + rates[i, 2])
+    return ((curve / 3.0 * z + 0.5 * bend) * z + start) * z, (curve * z + bend) * z + start, 2.0 * curve * z + bend
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _bounds(
+    nodes: Floats, rates: Floats, first: Floats, second: Floats, velocity: Floats, most: Floats, slope: Floats, half: Floats
+) -> None:
+    """Every interval's bounds: of acceleration as strips |y + slope x| <= half (n, 3 joints), of speed as x <= most (n, 3).
+
+    ``first`` and ``second`` (2n + 1, joints) are derivatives by tau. The three places are an interval's beginning, middle and end.
+    """
+    joints = first.shape[1]
+    for i in range(rates.shape[0]):
+        width = nodes[i + 1] - nodes[i]
+        unit = _within(rates, i, 1.0)[0]
+        for place in range(3):
+            j = 2 * i + place
+            s, _, bend = _within(rates, i, 0.5 * place)
+            rate, passed = rates[i, place], s / unit
+            most[i, place] = _FASTEST
+            for k in range(joints):
+                if rate > 0.0:
+                    along = first[j, k] / rate
+                    across = (second[j, k] - along * bend / width) / rate**2
+                else:  # at rest in tau: the limit of the quotient, or nearly that, the next point's; x is 0, so that across does not matter
+                    simple = abs(bend) > _SLOW * rates[i, 1]
+                    along, across = second[j, k] * width / bend if simple else first[2 * i + 1, k] / rates[i, 1], 0.0
+                if along * along * most[i, place] > velocity[k] * velocity[k]:
+                    most[i, place] = (velocity[k] / along) ** 2
+                along /= 2.0 * unit * width
+                of_x, of_y = across * (1.0 - passed) - along, across * passed + along
+                if of_y < 0.0:
+                    of_x, of_y = -of_x, -of_y
+                row = place * joints + k
+                if max(abs(of_x), of_y) * _FASTEST < 1.0:
+                    slope[i, row], half[i, row] = 0.0, _NEVER
+                else:
+                    of_y = max(of_y, 1e-12 * abs(of_x))  # a bound of x alone is nearly one
+                    slope[i, row], half[i, row] = of_x / of_y, 1.0 / of_y
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _greatest_start(slope: Floats, half: Floats, i: int, x: float, y_most: float, sum_most: float) -> float:
+    """The greatest start value of interval i, at most ``x``, with a y in all strips, at most ``y_most`` and ``sum_most`` less the start.
+
+    The least and the greatest such y are a convex and a concave function of the start, in order at 0: where they cross is found by
+    Newton's method from the right, which ends after finitely many steps.
+    """
+    x = min(x, sum_most)
+    rows = slope.shape[1]
+    y_least = _LEAST * y_most
+    for row in range(rows):
+        y_least = min(y_least, 0.5 * half[i, row])
+    for _ in range(2 * rows):
+        low, low_slope = y_least, 0.0
+        high, high_slope = y_most, 0.0
+        if sum_most - x < high:
+            high, high_slope = sum_most - x, -1.0
+        for row in range(rows):
+            middle = -slope[i, row] * x
+            if middle - half[i, row] > low:
+                low, low_slope = middle - half[i, row], -slope[i, row]
+            if middle + half[i, row] < high:
+                high, high_slope = middle + half[i, row], -slope[i, row]
+        if low <= high or low_slope <= high_slope:
+            break
+        x = max(x - (low - high) / (low_slope - high_slope), 0.0)
+    return x
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _squared_speeds(stops: Bools, most: Floats, slope: Floats, half: Floats) -> Floats:
+    """The greatest x at each grid point (n + 1,), 0 at ``stops`` (n + 1,) and at both ends."""
+    n = slope.shape[0]
+    x = np.zeros(n + 1)
+    for i in range(n - 1, 0, -1):
+        if not stops[i]:
+            x[i] = _greatest_start(slope, half, i, min(most[i - 1, 2], most[i, 0]), x[i + 1], 2.0 * most[i, 1])
+    for i in range(n - 1):
+        y = min(x[i + 1], 2.0 * most[i, 1] - x[i])
+        for row in range(slope.shape[1]):
+            y = min(y, half[i, row] - slope[i, row] * x[i])
+        x[i + 1] = max(y, 0.0)
+    return x
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _excess(nodes: Floats, rates: Floats, squares: Floats, first: Floats, second: Floats, velocity: Floats, excess: Floats) -> float:
+    """The greatest acceleration, or square of a speed, relative to its limit, at the quarters of the intervals; at least 1.
+
+    That of each interval is written to ``excess`` (n,). ``first`` and ``second`` (2n, joints) are derivatives by tau at the quarters.
+    """
+    worst = 1.0
+    for i in range(rates.shape[0]):
+        excess[i] = 1.0
+        width = nodes[i + 1] - nodes[i]
+        rise = (squares[i + 1] - squares[i]) / _within(rates, i, 1.0)[0]
+        for side in range(2):
+            s, rate, bend = _within(rates, i, 0.25 + 0.5 * side)
+            if rate < _SLOW:
+                continue
+            x, u = squares[i] + s * rise, 0.5 * rise / width
+            for k in range(first.shape[1]):
+                along = first[2 * i + side, k] / rate
+                across = (second[2 * i + side, k] - along * bend / width) / rate**2
+                excess[i] = max(excess[i], abs(across * x + along * u), x * (along / velocity[k]) ** 2)
+        worst = max(worst, excess[i])
+    return worst
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fastest(
+    nodes: Floats, stops: Bools, rounds: int, first_points: Floats, second_points: Floats, knots: Floats, degree: int, velocity: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """ds/dtau (n, 3), x (n + 1,) and the time (n + 1,) of the fastest motion on grid points ``nodes`` (n + 1,) that halts at ``stops``.
+
+    ``first_points`` and ``second_points`` are control points of the derivatives; they and ``velocity`` are in units of the acceleration
+    limits. The result is checked at the quarters of the intervals as well: up to ``rounds`` times the limits of the intervals where
+    it exceeds them are made stricter, and what is left is taken out of the whole motion. With 0 rounds there is no check.
+    """
+    n = nodes.shape[0] - 1
+    places, quarters = np.empty(2 * n + 1), np.empty(2 * n)
+    places[2 * n] = nodes[n]
+    for i in range(n):
+        places[2 * i], places[2 * i + 1] = nodes[i], 0.5 * (nodes[i] + nodes[i + 1])
+        quarters[2 * i], quarters[2 * i + 1] = 0.75 * nodes[i] + 0.25 * nodes[i + 1], 0.25 * nodes[i] + 0.75 * nodes[i + 1]
+    first, second = spline(first_points, knots[1:-1], degree - 1, places), spline(second_points, knots[2:-2], degree - 2, places)
+    rates = _parameter_rates(nodes, first, second)
+    most, slope, half = np.empty((n, 3)), np.empty((n, 3 * first.shape[1])), np.empty((n, 3 * first.shape[1]))
+    _bounds(nodes, rates, first, second, velocity, most, slope, half)
+    squares = _squared_speeds(stops, most, slope, half)
+    worst = 1.0
+    if rounds > 0:
+        first, second = spline(first_points, knots[1:-1], degree - 1, quarters), spline(second_points, knots[2:-2], degree - 2, quarters)
+        excess = np.empty(n)
+        for turn in range(rounds + 1):
+            worst = _excess(nodes, rates, squares, first, second, velocity, excess)
+            if worst <= _SETTLED or turn == rounds:
+                break
+            for i in range(n):
+                for place in range(3):
+                    most[i, place] /= excess[i]
+                for row in range(slope.shape[1]):
+                    half[i, row] /= excess[i]
+            squares = _squared_speeds(stops, most, slope, half)
+    times = np.zeros(n + 1)
+    for i in range(n + 1):
+        squares[i] /= worst
+        if i > 0:
+            length = (nodes[i] - nodes[i - 1]) * _within(rates, i - 1, 1.0)[0]
+            times[i] = times[i - 1] + 2.0 * length / (math.sqrt(squares[i - 1]) + math.sqrt(squares[i]))
+    return rates, squares, times
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def time_law(nodes: Floats, rates: Floats, squares: Floats, times: Floats, t: Floats) -> tuple[Floats, Floats]:
+    """The tau and dtau/dt (m,) at times ``t`` (m,), ascending."""
+    tau = np.empty(t.shape[0])
+    tau_rate = np.empty(t.shape[0])
+    i = 0
+    for j in range(t.shape[0]):
+        while i < times.shape[0] - 2 and t[j] > times[i + 1]:
+            i += 1
+        width = nodes[i + 1] - nodes[i]
+        length = _within(rates, i, 1.0)[0]
+        passed = t[j] - times[i]
+        speed = math.sqrt(squares[i])
+        u = (squares[i + 1] - squares[i]) / (2.0 * length * width)
+        target = (speed + 0.5 * u * passed) * passed / width
+        # Solve s(z) = target: Newton's method, or halving where that leaves the bracket.
+        low, high = 0.0, 1.0
+        z = min(max(target / length, 0.0), 1.0)
+        for _ in range(60):
+            s, rate, _ = _within(rates, i, z)
+            if s > target:
+                high = z
+            else:
+                low = z
+            last = z
+            z = z - (s - target) / rate
+            if not low <= z <= high:
+                z = 0.5 * (low + high)
+            if abs(z - last) < 1e-13:
+                break
+        rate = _within(rates, i, z)[1]
+        tau[j] = nodes[i] + width * z
+        tau_rate[j] = max(speed + u * passed, 0.0) / rate if rate > 0.0 else 0.0
+    return tau, tau_rate
