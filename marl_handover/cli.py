@@ -34,6 +34,7 @@ COMMANDS: dict[str, Command] = {
     "plan": Command("solve one problem: the sequence, its cost and every intermediate pose", "marl_handover.commands.plan"),
     "train": Command("train a supervisor into a run directory", "marl_handover.commands.train"),
     "evaluate": Command("play episodes with a policy: table, JSON, trace", "marl_handover.commands.evaluate"),
+    "simulate": Command("play episodes in the PyBullet cell: text, MP4 or GIF", "marl_handover.commands.simulate"),
     "plot": Command("a figure of a run, a trace or a cell", "marl_handover.commands.plot"),
 }
 

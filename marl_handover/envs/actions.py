@@ -14,6 +14,9 @@ from marl_handover.motion.trajectory import CyclePaths
 
 Floats = NDArray[np.float64]
 
+REASONS = (Refusal.DECLINED, Refusal.OUT_OF_REACH, Refusal.NO_PATH)
+"""What an arm's ``reason`` stands for; numbers as in :mod:`marl_handover.motion.executor`."""
+
 SNAP_RAD = 1e-6
 """A control point this far beyond a joint's limit is put on it: float32 rounding, not a command."""
 
@@ -37,7 +40,8 @@ def read_cycle(action: Any, control_points: int, arm: ArmModel) -> CyclePaths | 
         if isinstance(value, Refusal):
             return value
     if not (grasp and release):
-        return Refusal.DECLINED
+        reason = _choice(action, "reason", len(REASONS)) if "reason" in action else 0  # who declines need not say why
+        return reason if isinstance(reason, Refusal) else REASONS[reason]
     paths = _numbers(action, "paths", (3, control_points, len(arm.lower_rad)))
     if isinstance(paths, Refusal):
         return paths

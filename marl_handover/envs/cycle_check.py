@@ -37,7 +37,8 @@ class Refusal(StrEnum):
     OUT_OF_REACH = "out_of_reach"  # the supervisor named an arm that cannot pick up there, or not place there
     WRONG_SHAPE = "wrong_shape"  # the action is not of its space: keys, shapes, choices
     NOT_FINITE = "not_finite"
-    DECLINED = "declined"  # the arm's answer
+    DECLINED = "declined"  # the arm's answer, without a reason
+    NO_PATH = "no_path"  # the arm's answer: it found no collision-free path
     JOINT_LIMITS = "joint_limits"
     NOT_CONTINUOUS = "not_continuous"  # a path does not start where the arm is then
     OBJECT_ELSEWHERE = "object_elsewhere"  # the grip would close where the object's pin is not

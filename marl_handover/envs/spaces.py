@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig
+from marl_handover.envs.actions import REASONS
 from marl_handover.motion.executor import ARM_AGENTS
 from marl_handover.task.rules import Rules
 
@@ -30,7 +31,8 @@ class Spaces:
 
     An arm observes whether it is ``active``; the ``target`` (2,) it is to take the object to (the object's own place if it is not active),
     world, mm; the ``object`` (3,); its ``joints`` (5,) and those of the others, ``other_joints``; and whether the transfer is ``final``. It
-    acts with ``paths`` (3, N, 5): control points in rad of approach, transfer and retreat; ``grasp`` and ``release``: 0 declines.
+    acts with ``paths`` (3, N, 5): control points in rad of approach, transfer and retreat; ``grasp`` and ``release``: 0 declines, and then
+    ``reason`` says why.
     """
 
     def __init__(self, model: CellModel, motion: MotionConfig) -> None:
@@ -96,4 +98,4 @@ class Spaces:
     def _arm_acts(self) -> Dict:
         shape = (3, self.control_points, len(self._lower))
         paths = Box(np.broadcast_to(self._lower, shape), np.broadcast_to(self._upper, shape))
-        return Dict(paths=paths, grasp=Discrete(2), release=Discrete(2))
+        return Dict(paths=paths, grasp=Discrete(2), release=Discrete(2), reason=Discrete(len(REASONS)))

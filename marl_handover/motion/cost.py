@@ -41,9 +41,6 @@ SHIPPED = "pretrained/motion_cost.npz"
 RADII, YAWS, DISTANCES = 9, 25, 257
 """Nodes of the table along both radii, along the yaw between the places, and of the string along the distance."""
 
-LEAST_MM = 1.0
-"""The string's length jumps from 0, at no distance, to twice the height it climbs at any: its first node is this far out."""
-
 
 class StaleTable(HandoverError):
     """A table of path costs belongs to another cell, other motion settings or another URDF than the ones asked for."""
@@ -206,7 +203,7 @@ def build_table(cell: Cell, motion: MotionConfig, *, progress: bool = True) -> C
             ends = _places(cell, middle, radii[i], radii[j], yaws[k])
             excess[i, j, k] = excess[j, i, k] = _excess_mm(planner, *ends)
     excess[np.isnan(excess)] = np.nanmax(excess)
-    distances = np.maximum(np.linspace(0.0, 2 * cell.r_max_mm, DISTANCES), LEAST_MM)
+    distances = np.linspace(0.0, 2 * cell.r_max_mm, DISTANCES)
     turns = 2 * np.arcsin(np.minimum(distances / (2 * cell.r_max_mm), math.sin(span / 2)))
     chords = [_places(cell, middle, cell.r_max_mm, cell.r_max_mm, turn) for turn in turns]
     string = np.array([planner.carrying(0, *ends, planner.parked_rad)[0].lower_bound_mm for ends in chords])

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from marl_handover.cell import CellModel, build_cell, cell_config
 from marl_handover.cell.spaces import points_in_base
 from marl_handover.config import CellConfig, MotionConfig, require_choice
-from marl_handover.errors import HandoverError, WorkFailed
-from marl_handover.motion.trajectory import CyclePaths
+from marl_handover.errors import HandoverError
+from marl_handover.motion.trajectory import CyclePaths, NoPath, OutOfArmsReach
 
 if TYPE_CHECKING:
     from marl_handover.motion.planner import MotionPlanner
@@ -25,19 +25,14 @@ ARM_AGENTS = ("arm_left", "arm_right")
 
 METHODS = ("optimised", "direct")
 
+DECLINED, OUT_OF_REACH, NO_PATH = range(3)
+"""Why an arm declines, as its action's ``reason`` says it: none given, no joints for one of the ends, no collision-free path."""
+
 ROLL_RAD = 0.02
 """The planner starts from wrist roll 0; a measured roll up to this is taken for it."""
 
 EDGE_RAD = 1e-4
 """A pose at the edge of the annulus may need a joint this far past its limit; the joint stays at it, the grip is some 20 um off."""
-
-
-class CannotReach(WorkFailed):
-    """No joint vector within the limits puts the level grip where it should be."""
-
-    def __init__(self, agent: str, position_mm: Floats) -> None:
-        super().__init__(f"{agent} cannot reach ({position_mm[0]:.1f}, {position_mm[1]:.1f}) mm with the hand level at the pick height")
-        self.agent, self.position_mm = agent, position_mm
 
 
 class ExecutorAgent:
@@ -65,19 +60,20 @@ class ExecutorAgent:
         self._planner: MotionPlanner | None = None
 
     def act(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """The arm's action: ``paths`` float32 (3, N, 5) in rad, and ``grasp`` and ``release``, both 0 where no cycle was found."""
+        """The arm's action: ``paths`` float32 (3, N, 5) in rad; ``grasp`` and ``release``, both 0 where no cycle was found; ``reason``."""
         joints, others = np.asarray(observation["joints"], float), np.asarray(observation["other_joints"], float)
         pick, place = np.asarray(observation["object"], float)[:2], np.asarray(observation["target"], float)
         planner = self._made_planner() if self.method == "optimised" else None
         try:
             paths = self._direct(pick, place, joints) if planner is None else self._optimised(planner, pick, place, joints, others)
-            self.last_refusal = None
+            self.last_refusal, reason = None, DECLINED
         except HandoverError as failure:
-            self.last_refusal = str(failure)
+            self.last_refusal, reason = str(failure), _code(failure)
             paths = CyclePaths(*(np.tile(joints, (self.motion.control_points, 1)) for _ in range(3)))
         lower, upper = self.model.arm.lower_rad.astype(np.float32), self.model.arm.upper_rad.astype(np.float32)
         willing = np.int64(self.last_refusal is None)
-        return {"paths": np.clip(np.stack(paths).astype(np.float32), lower, upper), "grasp": willing, "release": willing}
+        points = np.clip(np.stack(paths).astype(np.float32), lower, upper)
+        return {"paths": points, "grasp": willing, "release": willing, "reason": np.int64(reason)}
 
     def _direct(self, pick_mm: Floats, place_mm: Floats, joints_rad: Floats) -> CyclePaths:
         ends = joints_rad, self._level(pick_mm), self._level(place_mm), np.radians(self.motion.parked_deg)
@@ -102,5 +98,9 @@ class ExecutorAgent:
         joints = arm.ik([x, y, self.model.cell.config.pick_height_mm])[0]
         inside = np.clip(joints, arm.lower_rad, arm.upper_rad)
         if not (abs(joints - inside) <= EDGE_RAD).all():
-            raise CannotReach(self.agent, position_mm)
+            raise OutOfArmsReach(self.arm, "be level", position_mm)
         return inside
+
+
+def _code(failure: HandoverError) -> int:
+    return OUT_OF_REACH if isinstance(failure, OutOfArmsReach) else NO_PATH if isinstance(failure, NoPath) else DECLINED

@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from marl_handover.cell.build import CellModel
 from marl_handover.cell.spaces import points_in_base
 from marl_handover.config import MotionConfig, require_at_least, require_between, require_positive
-from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed
+from marl_handover.errors import InvalidSetting, NotFinite
 from marl_handover.motion.body import arm_body, ball_around, standing_arm, standing_block
 from marl_handover.motion.scene import Scene
 from marl_handover.motion.segment import FoundPath, Segment, find_path
 from marl_handover.motion.starts import carrying_starts, reaching_starts
-from marl_handover.motion.trajectory import CyclePaths, TransferMotion
+from marl_handover.motion.trajectory import CyclePaths, OutOfArmsReach, TransferMotion
 
 Floats = NDArray[np.float64]
 
@@ -30,14 +30,6 @@ EDGE_RAD = 1e-4
 NOTICE_S = 1.5
 STILL_MM = 1e-3
 """A transfer shorter than this is none."""
-
-
-class OutOfArmsReach(WorkFailed):
-    """A command names a place outside the arm's own manipulation space."""
-
-    def __init__(self, arm: int, what: str, position_mm: Floats) -> None:
-        self.arm, self.what, self.position_mm = arm, what, position_mm
-        super().__init__(f"arm {arm} cannot {what} at ({position_mm[0]:.1f}, {position_mm[1]:.1f}) mm: outside its manipulation space")
 
 
 class MotionPlanner:

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.errors import WorkFailed
 from marl_handover.motion.body import MARGIN_MM, ArmBody, ball_around, out_of_reach
 from marl_handover.motion.descent import Effort, Spline, descend
 from marl_handover.motion.scene import Scene
 from marl_handover.motion.splines import basis, sampled_basis
 from marl_handover.motion.starts import bent, fitted, sample_places, smoothing_metric
+from marl_handover.motion.trajectory import NoPath
 from marl_handover.motion.verify import ROUNDING_MM, Margins, dense_margins
 
 Floats = NDArray[np.float64]
@@ -40,18 +40,6 @@ GOOD_RATIO = 1.02
 
 WANTED, FAIR_RATIO = 2, 1.08
 """Feasible paths to choose from where none is that good; one more where none is even fair."""
-
-
-class NoPath(WorkFailed):
-    """No collision-free path was found. ``reason``: ``start``, ``end`` (that pose itself is too near something) or ``path``."""
-
-    def __init__(self, reason: str, what: str, shortfall_mm: float, starts: int) -> None:
-        self.reason, self.what, self.shortfall_mm, self.starts = reason, what, shortfall_mm, starts
-        if reason == "path":
-            text = f"no collision-free path among {starts} starts; the nearest miss is {shortfall_mm:.1f} mm short of {what}"
-        else:
-            text = f"the {reason} pose is {shortfall_mm:.1f} mm short of {what}"
-        super().__init__(text)
 
 
 class FoundPath(NamedTuple):

@@ -8,10 +8,32 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.errors import WorkFailed
+
 Floats = NDArray[np.float64]
 
 PHASES = ("approach", "grasp", "lift", "transfer", "lower", "release", "retreat")
 """Names of a cycle's phases, in order."""
+
+
+class NoPath(WorkFailed):
+    """No collision-free path was found. ``reason``: ``start``, ``end`` (that pose itself is too near something) or ``path``."""
+
+    def __init__(self, reason: str, what: str, shortfall_mm: float, starts: int) -> None:
+        self.reason, self.what, self.shortfall_mm, self.starts = reason, what, shortfall_mm, starts
+        if reason == "path":
+            text = f"no collision-free path among {starts} starts; the nearest miss is {shortfall_mm:.1f} mm short of {what}"
+        else:
+            text = f"the {reason} pose is {shortfall_mm:.1f} mm short of {what}"
+        super().__init__(text)
+
+
+class OutOfArmsReach(WorkFailed):
+    """A command names a place outside the arm's own manipulation space."""
+
+    def __init__(self, arm: int, what: str, position_mm: Floats) -> None:
+        self.arm, self.what, self.position_mm = arm, what, position_mm
+        super().__init__(f"arm {arm} cannot {what} at ({position_mm[0]:.1f}, {position_mm[1]:.1f}) mm: outside its manipulation space")
 
 
 class CyclePaths(NamedTuple):

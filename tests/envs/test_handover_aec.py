@@ -28,7 +28,7 @@ from marl_handover.task.rules import Outcome, Rules
 
 SUPERVISOR, LEFT, RIGHT = "supervisor", "arm_left", "arm_right"
 ARMS = (LEFT, RIGHT)
-KEYS = ("final", "arm", "place", "paths", "grasp", "release")
+KEYS = ("final", "arm", "place", "paths", "grasp", "release", "reason")
 MIDDLE = {"final": 0, "place": np.zeros(2, np.float32)}
 EASY = {"state": [0.0, 0.0, 0.0], "goal": [200.0, 180.0, math.pi / 2]}  # the left arm can finish at once
 FAR = {
@@ -234,6 +234,24 @@ def test_a_refused_finish_of_architecture_a_ends_it(model):
     env.step({**MIDDLE, "arm": 0})
     env.step({"grasp": 0, "release": 1})
     assert result(env) == (-1, True, False, {"refusal": "declined", "transfers": 1, "outcome": "wrong_position"})
+
+
+@pytest.mark.parametrize(("reason", "refusal"), [(None, "declined"), (0, "declined"), (1, "out_of_reach"), (2, "no_path"), (9, "wrong_shape")])
+def test_the_supervisor_sees_why_an_arm_declines(model, reason, refusal):
+    env = begun(model, "B", EASY)
+    env.step({**MIDDLE, "arm": 0})
+    env.step({"grasp": 0, "release": 0} | ({} if reason is None else {"reason": reason}))
+    assert env.infos[SUPERVISOR]["refusal"] == refusal
+
+
+def test_an_executor_that_finds_no_path_says_so(model):
+    """The other arm stands where the object is to go."""
+    agent = ExecutorAgent("arm_left", model)
+    pick, place, other = np.array([-200.0, 150.0]), np.array([0.0, 0.0]), model.arm.ik([180.0, 0.0, 45.0])[0]
+    seen = {"object": np.append(pick, 0.0), "target": place, "joints": np.radians(MotionConfig().parked_deg), "other_joints": other}
+    action = agent.act(seen)
+    assert (action["grasp"], action["release"], action["reason"]) == (0, 0, 2)
+    assert "short of the clearance to the other arm" in agent.last_refusal
 
 
 @architectures
