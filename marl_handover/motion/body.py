@@ -32,7 +32,7 @@ class ArmBody:
 
     ``pairs`` index capsules that must not touch and might, within the joint ``limits`` (4, 2); the others are proved apart. ``edges``
     (2, 2) are the held block's lower front and rear edge in the wrist's frame. ``reach_mm``: nothing of the arm, or held by it, is ever
-    farther from the yaw axis.
+    farther from the yaw axis; ``levers_mm`` (4,): the same of each joint's axis, of what it moves.
     """
 
     planar: Floats
@@ -43,6 +43,7 @@ class ArmBody:
     edges: Floats
     limits: Floats
     reach_mm: float
+    levers_mm: Floats
 
 
 def arm_body(model: CellModel, motion: MotionConfig) -> ArmBody:
@@ -87,9 +88,9 @@ def arm_body(model: CellModel, motion: MotionConfig) -> ArmBody:
     grouped = (held[all_pairs[:, 0], 0] < 2) & (held[all_pairs[:, 1], 0] >= 4)
     all_pairs = np.concatenate([all_pairs[grouped], all_pairs[~grouped]])  # the kernels skip the first ones together
     planar = np.concatenate([planar, _planar_ball(fixed), _planar_ball(hand)])
-    return ArmBody(
-        planar, capsules, all_pairs[all_pairs.max(axis=1) < len(capsules)], held, all_pairs, edges, limits, _reach_mm(planar, held, limits)
-    )
+    levers = _levers_mm(planar, held, limits)
+    bare_pairs = all_pairs[all_pairs.max(axis=1) < len(capsules)]
+    return ArmBody(planar, capsules, bare_pairs, held, all_pairs, edges, limits, float(levers[0]), levers)
 
 
 def block_capsules(block: BlockConfig, grip_to_table_mm: float) -> list[Capsule]:
@@ -163,19 +164,25 @@ def out_of_reach(body: ArmBody, obstacles: Floats) -> NDArray[np.bool_]:
     return np.asarray(nearer - obstacles[:, 6] - obstacles[:, 7] - MARGIN_MM > body.reach_mm)
 
 
-def _reach_mm(planar: Floats, held: Floats, limits: Floats) -> float:
-    """A bound on how far from the yaw axis any part of the arm, or of what it holds, can be."""
+def _levers_mm(planar: Floats, held: Floats, limits: Floats) -> Floats:
+    """Bounds (4,) on how far from the axes of yaw, shoulder, elbow and wrist pitch any part of the arm beyond, or held by it, can be."""
     upper, forearm = math.hypot(planar[2], planar[3]), math.hypot(planar[4], planar[5])
     # The wrist is farthest from the shoulder where the elbow is least bent.
     angle = math.atan2(planar[5], planar[4]) - math.atan2(planar[3], planar[2])
     low, high = limits[2] + angle
     bend = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
     wrist = math.sqrt(upper**2 + forearm**2 + 2 * upper * forearm * math.cos(min(bend, math.pi)))
-    at_wrist = held[held[:, 0] >= 4]
-    hand = (np.linalg.norm(at_wrist[:, 1:7].reshape(-1, 2, 3), axis=-1).max(axis=1) + at_wrist[:, 7]).max()
-    before = held[held[:, 0] < 4]
-    arm = (np.linalg.norm(before[:, 1:7].reshape(-1, 2, 3), axis=-1).max(axis=1) + before[:, 7]).max()
-    return float(abs(planar[0]) + max(wrist + hand, upper + arm, arm))
+
+    def beyond_pivot(level: int) -> float:
+        rows = held[held[:, 0] == level]
+        return float((np.linalg.norm(rows[:, 1:7].reshape(-1, 2, 3), axis=-1).max(axis=1) + rows[:, 7]).max()) if len(rows) else 0.0
+
+    hand = beyond_pivot(4)
+    elbow = max(beyond_pivot(3), forearm + hand)
+    shoulder = max(beyond_pivot(2), upper + beyond_pivot(3), wrist + hand)
+    standing = max(float(np.hypot(held[held[:, 0] < 2][:, [1, 4]], held[held[:, 0] < 2][:, [2, 5]]).max(initial=0.0)), 0.0)
+    standing += float(held[held[:, 0] < 2, 7].max(initial=0.0))
+    return np.array([max(abs(planar[0]) + shoulder, standing), shoulder, elbow, hand])
 
 
 def _with_half_lengths(rows: list[list[float]], first: int) -> Floats:
