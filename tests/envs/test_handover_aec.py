@@ -236,7 +236,9 @@ def test_a_refused_finish_of_architecture_a_ends_it(model):
     assert result(env) == (-1, True, False, {"refusal": "declined", "transfers": 1, "outcome": "wrong_position"})
 
 
-@pytest.mark.parametrize(("reason", "refusal"), [(None, "declined"), (0, "declined"), (1, "out_of_reach"), (2, "no_path"), (9, "wrong_shape")])
+@pytest.mark.parametrize(
+    ("reason", "refusal"), [(None, "declined"), (0, "declined"), (1, "out_of_reach"), (2, "no_path"), (9, "wrong_shape")]
+)
 def test_the_supervisor_sees_why_an_arm_declines(model, reason, refusal):
     env = begun(model, "B", EASY)
     env.step({**MIDDLE, "arm": 0})

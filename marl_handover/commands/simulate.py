@@ -1,0 +1,197 @@
+"""``marl-handover simulate``: closed-loop episodes in PyBullet, to read and to watch."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from marl_handover import policies
+from marl_handover.arrays import wrap
+from marl_handover.cell import build_cell
+from marl_handover.cell.symmetry import ARM_LETTERS
+from marl_handover.config import CellConfig, MotionConfig, TaskChanges, require_at_least, require_seed
+from marl_handover.errors import InvalidSetting, WorkFailed
+
+if TYPE_CHECKING:
+    from marl_handover.envs.handover_aec import HandoverEnv
+    from marl_handover.motion.executor import ExecutorAgent
+    from marl_handover.simulation.backend import BulletBackend
+    from marl_handover.simulation.video import Video
+
+Floats = NDArray[np.float64]
+
+
+@dataclass
+class SimulateCommand:
+    """Settings of ``simulate``. What is not given is the policy's own, or the default."""
+
+    policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
+    episodes: int = 1  # played one after the other
+    seed: int = 0  # of the problems
+    start: list[float] | None = None  # x [mm], y [mm], orientation [deg]; null: random
+    goal: list[float] | None = None  # the same; null: random
+    cell: CellConfig | None = None  # single keys change the paper cell
+    task: TaskChanges = field(default_factory=TaskChanges)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    grasp: str = "friction"  # friction, or constraint: a rigid joint while both fingers are on the pin
+    video: str = ""  # .mp4 or .gif
+    fps: float = 12.5  # of the video, in simulated time
+    size: list[int] = field(default_factory=lambda: [640, 360])  # of the video: width, height in pixels
+    view: str = "overview"  # of the video: overview, or top (the cell's camera)
+    gui: bool = False  # open PyBullet's window
+    progress: bool = True
+
+
+SCHEMA = SimulateCommand
+ALIASES = {key: f"task.{key}" for key in ("epsilon_deg", "architecture", "max_steps")}
+GROUPS: dict[str, dict[str, type]] = {}
+
+
+class Played(NamedTuple):
+    """An episode: how it ended, and what it took."""
+
+    outcome: str
+    transfers: int
+    simulated_s: float
+    wall_s: float
+
+
+def run(config: SimulateCommand) -> int:
+    """Play, print, write. Raises :class:`WorkFailed` if an episode misses its goal."""
+    from marl_handover.simulation.backend import BulletBackend
+    from marl_handover.simulation.camera import OVERVIEW, TOP
+
+    views = {"overview": OVERVIEW, "top": TOP}
+    width, height = _check(config, tuple(views))
+    policy = policies.adapted(config.policy, config.cell, config.seed, **vars(config.task))
+    model = build_cell(policy.rules.cell.config)
+    backend = BulletBackend(model, config.motion, grasp=config.grasp, gui=config.gui, camera=views[config.view], size=(width, height))
+    try:
+        with _recording(config, backend) as frames:
+            played = list(_episodes(config, policy, model, backend, frames))
+    finally:
+        backend.close()
+    failed = [episode.outcome for episode in played if episode.outcome != "success"]
+    simulated, wall = sum(p.simulated_s for p in played), sum(p.wall_s for p in played)
+    print(f"{len(played) - len(failed)} of {len(played)} episodes reached the goal; {simulated:.1f} s simulated in {wall:.1f} s")
+    if failed:
+        raise WorkFailed(f"policy {config.policy!r} did not reach the goal: {', '.join(sorted(set(failed)))}")
+    return 0
+
+
+def _check(config: SimulateCommand, views: tuple[str, ...]) -> tuple[int, int]:
+    """The video's size. Raises for settings that cannot be, before anything is built."""
+    from marl_handover.config import require_between, require_choice
+    from marl_handover.simulation.video import require_video
+    from marl_handover.simulation.world import GRASPS
+
+    require_at_least("episodes", config.episodes, 1)
+    require_seed(config.seed)
+    require_choice("grasp", config.grasp, GRASPS)
+    require_choice("view", config.view, views)
+    require_between("fps", config.fps, 1, 50)
+    if len(config.size) != 2 or not all(16 <= side <= 4096 and side % 2 == 0 for side in config.size):
+        raise InvalidSetting("size", list(config.size), "two even numbers of pixels, 16 to 4096: [width, height]")
+    for name in ("start", "goal"):
+        pose = getattr(config, name)
+        if pose is not None and len(pose) != 3:
+            raise InvalidSetting(name, list(pose), "[x_mm, y_mm, degrees]")
+    if config.video:
+        require_video("video", config.video)
+    return config.size[0], config.size[1]
+
+
+@contextmanager
+def _recording(config: SimulateCommand, backend: BulletBackend) -> Iterator[Video | None]:
+    """The video, if one is asked for; it gets a frame whenever one is due while arms move."""
+    if not config.video:
+        with nullcontext():
+            yield None
+        return
+    from marl_handover.simulation.video import FrameClock, Video
+    from marl_handover.simulation.world import CONTROL_S
+
+    clock = FrameClock(config.fps, CONTROL_S)
+    with Video(config.video, config.fps) as video:
+
+        def step() -> None:
+            for _ in range(clock.due()):
+                video.add(backend.render())
+
+        backend.on_step = step
+        yield video
+        video.add(backend.render())
+    print(f"wrote {config.video}")
+
+
+def _episodes(
+    config: SimulateCommand, policy: policies.SupervisorPolicy, model: Any, backend: BulletBackend, frames: Video | None
+) -> Iterator[Played]:
+    from marl_handover.envs.handover_aec import raw_env
+    from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
+
+    env = raw_env(backend=backend, cell=model, task=policy.rules.config, motion=config.motion)
+    supervisor = policy.under(env.rules)
+    arms = {agent: ExecutorAgent(agent, model, motion=config.motion) for agent in ARM_AGENTS}
+    problem = {}
+    for key, given in (("state", config.start), ("goal", config.goal)):
+        if given is not None:
+            problem[key] = [given[0], given[1], float(wrap(math.radians(given[2])))]
+    with tqdm(total=config.episodes, unit="episode", disable=not config.progress, leave=False) as bar:
+        for episode in range(config.episodes):
+            env.reset(seed=config.seed if episode == 0 else None, options=problem or None)
+            if frames is not None:
+                frames.add(backend.render())
+            yield play(env, supervisor, arms, backend, lambda line: bar.write(line))
+            bar.update()
+
+
+def play(
+    env: HandoverEnv,
+    supervisor: policies.SupervisorPolicy,
+    arms: dict[str, ExecutorAgent],
+    backend: BulletBackend,
+    say: Callable[[str], None],
+) -> Played:
+    """Play one episode from where ``env`` was reset to; ``say`` gets one line a transfer."""
+    simulated, began = 0.0, time.perf_counter()
+    goal = env.observe("supervisor")["goal"]
+    say(f"object {_pose(backend.cell.object_pose())} to goal {_pose(goal)}")
+    while not (env.terminations["supervisor"] or env.truncations["supervisor"]):
+        agent = env.agent_selection
+        observation = env.observe(agent)
+        if agent == "supervisor":
+            env.step(supervisor(observation))
+            continue
+        started, backend.last = time.perf_counter(), None
+        action = arms[agent].act(observation)
+        env.step(action)
+        seconds = 0.0 if backend.last is None else backend.last.duration_s
+        simulated += seconds
+        refusal = env.infos[agent]["refusal"]
+        came = "done" if refusal is None else f"{refusal}{_reason(arms[agent])}"
+        rate = seconds / (time.perf_counter() - started)
+        say(
+            f"  {ARM_LETTERS[arms[agent].arm]} to {np.round(observation['target'], 1).tolist()}: {came}; "
+            f"object {_pose(backend.cell.object_pose())}; {seconds:.1f} s, {rate:.1f} x real time"
+        )
+    outcome = str(env.infos["supervisor"]["outcome"])
+    played = Played(outcome, int(env.infos["supervisor"]["transfers"]), simulated, time.perf_counter() - began)
+    say(f"{outcome} after {played.transfers} transfers")
+    return played
+
+
+def _reason(arm: ExecutorAgent) -> str:
+    return "" if arm.last_refusal is None else f" ({arm.last_refusal})"
+
+
+def _pose(pose: Floats) -> str:
+    return f"({pose[0]:.1f} mm, {pose[1]:.1f} mm, {math.degrees(pose[2]):.1f} deg)"

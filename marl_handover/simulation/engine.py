@@ -1,0 +1,186 @@
+"""One PyBullet world of its own, its constants, and the change of units between it and the package.
+
+The world is blown up by :data:`SCALE`: Bullet's collision tolerances are made for bodies of decimetres, and a pin 2.5 mm thick is finer
+than they are. Only this module knows the factor. Masses and seconds stay, so forces grow by it, torques and inertias by its square.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pybullet
+from numpy.typing import NDArray
+
+from marl_handover.errors import WorkFailed
+
+Floats = NDArray[np.float64]
+
+SCALE = 10.0
+_UNITS_PER_MM = SCALE / 1000.0
+
+
+class Pace(NamedTuple):
+    """How finely time is cut, and how long the solver works on each piece."""
+
+    step_s: float
+    iterations: int
+
+
+COARSE = Pace(1 / 250, 50)
+"""For arms that move in free air, and a block that stands."""
+
+FINE = Pace(1 / 1000, 300)
+"""For fingers on a thin pin: with less, the solver's leftover forces turn the block in the grip when the hand pitches on the way."""
+
+_GRAVITY_M_S2 = 9.81
+
+
+class NoWindow(WorkFailed):
+    """PyBullet cannot open its window."""
+
+    exit_status = 2
+
+    def __init__(self) -> None:
+        super().__init__("gui = true: PyBullet's window needs a display, and DISPLAY is not set; use gui=false, and video=FILE")
+
+
+class Surface(NamedTuple):
+    """Friction of a body's surface; Bullet multiplies the lateral values of two that touch.
+
+    ``patch_mm`` stands for the radius of a soft contact patch, which resists rolling and spinning.
+    """
+
+    lateral: float
+    patch_mm: float = 0.0
+
+
+class Touch(NamedTuple):
+    """Two links that touch; link -1 is a body's base. ``distance_mm`` is negative where they overlap."""
+
+    first: tuple[int, int]
+    second: tuple[int, int]
+    distance_mm: float
+    force_n: float
+
+
+class Engine:
+    """A physics client. Several live side by side in one process; each call names its own."""
+
+    def __init__(self, gui: bool = False) -> None:
+        # Without a display PyBullet does not fail, it ends the process.
+        if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+            raise NoWindow()
+        try:
+            self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
+        except pybullet.error as error:
+            raise NoWindow() from error
+        if self.client < 0:
+            raise NoWindow()
+        self.time_s = 0.0
+
+    def clear(self) -> None:
+        """An empty world at time 0, as if just connected: nothing of what went before is left to influence what comes."""
+        pybullet.resetSimulation(physicsClientId=self.client)
+        pybullet.setGravity(0, 0, -_GRAVITY_M_S2 * SCALE, physicsClientId=self.client)
+        pybullet.setPhysicsEngineParameter(numSubSteps=0, deterministicOverlappingPairs=1, physicsClientId=self.client)
+        self.pace(COARSE)
+        self.time_s = 0.0
+
+    def pace(self, pace: Pace) -> None:
+        """Cut time this finely from now on."""
+        self._step_s = pace.step_s
+        pybullet.setPhysicsEngineParameter(fixedTimeStep=pace.step_s, numSolverIterations=pace.iterations, physicsClientId=self.client)
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass, in whole steps."""
+        steps = round(seconds / self._step_s)
+        for _ in range(steps):
+            pybullet.stepSimulation(physicsClientId=self.client)
+        self.time_s += steps * self._step_s
+
+    def close(self) -> None:
+        """Disconnect; a second call does nothing."""
+        if self.client >= 0:
+            pybullet.disconnect(physicsClientId=self.client)
+        self.client = -1
+
+    def load_arm(self, path: Path, x_mm: float, y_mm: float, yaw_rad: float) -> int:
+        """A URDF with its base fixed to the table; gives the body's number."""
+        body = pybullet.loadURDF(
+            str(path),
+            basePosition=[length(x_mm), length(y_mm), 0.0],
+            baseOrientation=pybullet.getQuaternionFromEuler([0.0, 0.0, yaw_rad]),
+            useFixedBase=True,
+            globalScaling=SCALE,
+            flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_SELF_COLLISION,
+            physicsClientId=self.client,
+        )
+        for link in range(pybullet.getNumJoints(body, physicsClientId=self.client)):
+            # globalScaling leaves inertias as the file has them.
+            inertia = pybullet.getDynamicsInfo(body, link, physicsClientId=self.client)[2]
+            self.dynamics(body, link, localInertiaDiagonal=[SCALE**2 * value for value in inertia], linearDamping=0.0, angularDamping=0.0)
+        return int(body)
+
+    def dynamics(self, body: int, link: int, **changes: Any) -> None:
+        """``changeDynamics`` in this client; values in the world's own units."""
+        pybullet.changeDynamics(body, link, physicsClientId=self.client, **changes)
+
+    def coat(self, body: int, links: Iterable[int], surface: Surface) -> None:
+        """Give links of a body a surface."""
+        for link in links:
+            self.dynamics(
+                body,
+                link,
+                lateralFriction=surface.lateral,
+                spinningFriction=length(surface.patch_mm),
+                rollingFriction=length(surface.patch_mm),
+            )
+
+    def touches(self, first: int, second: int, first_link: int | None = None) -> list[Touch]:
+        """Where two bodies touched in the last step."""
+        only = {} if first_link is None else {"linkIndexA": first_link}
+        found = pybullet.getContactPoints(bodyA=first, bodyB=second, physicsClientId=self.client, **only) or ()
+        return [Touch((hit[1], hit[3]), (hit[2], hit[4]), hit[8] / _UNITS_PER_MM, hit[9] / SCALE) for hit in found]
+
+
+def length(mm: float) -> float:
+    """Millimetres as the world's length."""
+    return mm * _UNITS_PER_MM
+
+
+def to_mm(world: Iterable[float]) -> Floats:
+    """World lengths as millimetres."""
+    return np.asarray(list(world), dtype=float) / _UNITS_PER_MM
+
+
+def force(newtons: float) -> float:
+    """A force as the world has it."""
+    return newtons * SCALE
+
+
+def torque(newton_metres: float) -> float:
+    """A torque as the world has it."""
+    return newton_metres * SCALE**2
+
+
+def inertia(kg_mm2: float) -> float:
+    """A moment of inertia as the world has it."""
+    return kg_mm2 * 1e-6 * SCALE**2
+
+
+def yaw_of(quaternion: Iterable[float]) -> float:
+    """World yaw of a body's x axis."""
+    rotation = pybullet.getMatrixFromQuaternion(list(quaternion))
+    return math.atan2(rotation[3], rotation[0])
+
+
+def tilt_of(quaternion: Iterable[float]) -> float:
+    """Angle between a body's z axis and the vertical."""
+    rotation = pybullet.getMatrixFromQuaternion(list(quaternion))
+    return math.acos(min(1.0, max(-1.0, rotation[8])))

@@ -1,0 +1,257 @@
+"""The simulated cell: two arms, a block and a table, and the running of timed cycles in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import numpy as np
+import pybullet
+from numpy.typing import ArrayLike
+
+from marl_handover.cell.build import CellModel
+from marl_handover.config import MotionConfig, require_choice
+from marl_handover.motion.trajectory import Phase
+from marl_handover.simulation.arm import SERVO_S, SimulatedArm
+from marl_handover.simulation.block import Block
+from marl_handover.simulation.camera import TOP, Camera, Pixels, picture
+from marl_handover.simulation.engine import COARSE, FINE, Engine, Floats, Surface, Touch, length
+
+GRASPS = ("friction", "constraint")
+CONTROL_S = 0.02
+"""How often a run looks at contacts and calls back."""
+
+_CONTROL_STEPS = round(CONTROL_S / SERVO_S)
+_TABLE = Surface(lateral=0.3)  # paper on wood; below block half-width / pick height, so that a nudged block slides and does not tip
+_SETTLE_S = 0.2
+_STANDING_LINKS = 1  # the base and the turret stand on the table
+
+
+@dataclass
+class ArmReport:
+    """What happened to one arm's cycle.
+
+    ``grasped``: both fingers held the pin when they had closed. ``kept``: they still did just before they opened. ``trace_rad`` (n, 5):
+    where the joints were every :data:`CONTROL_S`, from grasp to release.
+    """
+
+    grasped: bool = False
+    kept: bool = False
+    trace_rad: list[Floats] = field(default_factory=list)
+
+
+class RunReport(NamedTuple):
+    """What happened in a run: per arm, and the first touch of each two bodies that must not (names such as "arm 0 - table")."""
+
+    arms: dict[int, ArmReport]
+    collisions: dict[str, Touch]
+    duration_s: float
+
+
+class _Track:
+    """An arm's phases as set-points."""
+
+    def __init__(self, phases: Sequence[Phase]) -> None:
+        t_s = np.concatenate([phase.t_s for phase in phases])
+        joints = np.concatenate([phase.joints_rad for phase in phases])
+        gripper = np.concatenate([phase.gripper_mm for phase in phases])
+        self.steps = max(1, math.ceil((t_s[-1] - t_s[0]) / SERVO_S - 1e-9))
+        times = t_s[0] + SERVO_S * np.arange(self.steps + 1)
+        self.joints_rad = np.stack([np.interp(times, t_s, column) for column in joints.T], axis=1)
+        self.velocity_rad_s = np.diff(self.joints_rad, axis=0, prepend=self.joints_rad[:1]) / SERVO_S
+        self.gripper_mm = np.interp(times, t_s, gripper)
+        spans = {phase.name: (phase.t_s[[0, -1]] - t_s[0]) / SERVO_S + 1e-9 for phase in phases}
+        never = np.array([np.inf, np.inf])
+        self.closes_at, self.closed_at = np.floor(spans.get("grasp", never))
+        self.opens_at, self.open_at = np.floor(spans.get("release", never))
+
+    def touches_pin(self, step: int) -> bool:
+        """Whether fingers move on the pin or hold it in this step."""
+        return bool(self.closes_at < step <= self.open_at)
+
+
+class BulletCell:
+    """Both arms, the block with its pin and the table in a PyBullet world of their own.
+
+    Deterministic: equal calls after :meth:`reset` give bit-identical states. A context manager.
+
+    Args:
+        model: the cell.
+        motion: where the arms park, and how far the fingers open.
+        grasp: "friction" (finger contact alone) or "constraint" (a rigid joint while both fingers are on the pin).
+        gui: open PyBullet's window.
+        seed: unused by the physics, which draws nothing at random; kept as :attr:`seed`.
+
+    Raises:
+        UnknownChoice: for another ``grasp``.
+        NoWindow: if ``gui`` and there is no display.
+    """
+
+    def __init__(self, model: CellModel, motion: MotionConfig, *, grasp: str = "friction", gui: bool = False, seed: int = 0) -> None:
+        require_choice("grasp", grasp, GRASPS)
+        self.model, self.motion, self.grasp, self.seed = model, motion, grasp, seed
+        self.parked_rad = np.radians(motion.parked_deg)
+        self.engine = Engine(gui)
+        self.reset((0.0, 0.0, 0.0))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let the physics client go; a second call does nothing."""
+        self.engine.close()
+
+    def reset(self, pose: ArrayLike) -> None:
+        """Both arms parked with open fingers, the block standing at ``pose`` (3,): x_mm, y_mm, theta_rad; settled, at time 0."""
+        self.engine.clear()
+        self._table = _table(self.engine)
+        self.arms = [SimulatedArm(self.engine, self.model.arm, base) for base in self.model.cell.bases]
+        self.block = Block(self.engine, self.model.cell.config.block)
+        self._bonds: dict[int, int] = {}
+        self._holding: set[int] = set()
+        for arm in self.arms:
+            arm.place(self.parked_rad, self.motion.finger_travel_mm)
+        self.block.place(np.asarray(pose, dtype=float))
+        self.settle()
+        self.engine.time_s = 0.0
+
+    def settle(self, seconds: float = _SETTLE_S) -> None:
+        """Let time pass while every servo holds its last set-point."""
+        self.engine.advance(seconds)
+
+    def object_pose(self) -> Floats:
+        """The block's true pose (3,): x_mm, y_mm, theta_rad."""
+        return self.block.pose()
+
+    def joints_rad(self) -> Floats:
+        """Where the joints are: (num_arms, 5)."""
+        return np.stack([arm.joints_rad() for arm in self.arms])
+
+    def tilt_rad(self) -> float:
+        """Angle between the pin and the vertical."""
+        return self.block.tilt_rad()
+
+    def held(self, arm: int) -> bool:
+        """Whether both fingers of ``arm`` press on the block or its pin."""
+        return all(
+            any(touch.force_n > 0 for touch in self.engine.touches(self.arms[arm].body, self.block.body, finger))
+            for finger in self.arms[arm].fingers
+        )
+
+    def collisions(self) -> dict[str, Touch]:
+        """The deepest touch of each two that must not touch: arms, an arm and the table (its base apart), a held block and another arm."""
+        found: dict[str, Touch] = {}
+        for index, arm in enumerate(self.arms):
+            self._note(
+                found, f"arm {index} - table", [t for t in self.engine.touches(arm.body, self._table) if t.first[1] >= _STANDING_LINKS]
+            )
+            for other in range(index):
+                self._note(found, f"arm {other} - arm {index}", self.engine.touches(arm.body, self.arms[other].body))
+            carrier = next((other for other in range(len(self.arms)) if other != index and other in self._holding), None)
+            if carrier is not None:
+                self._note(found, f"block - arm {index}", self.engine.touches(arm.body, self.block.body))
+        return found
+
+    def camera_image(self, width: int = TOP.width_px, height: int = TOP.height_px, camera: Camera = TOP) -> Pixels:
+        """What ``camera`` sees now: RGB (height, width, 3)."""
+        return picture(self.engine, camera, width, height)
+
+    def run(self, arm: int, phases: Sequence[Phase], on_step: Callable[[], None] | None = None) -> RunReport:
+        """Carry out a timed cycle with ``arm``, the others holding still; see :meth:`run_together`."""
+        return self.run_together({arm: phases}, on_step)
+
+    def run_together(self, cycles: Mapping[int, Sequence[Phase]], on_step: Callable[[], None] | None = None) -> RunReport:
+        """Carry out timed cycles, arm -> phases, on one clock that starts with each one's first sample; then settle.
+
+        ``on_step`` is called every :data:`CONTROL_S`, for pictures and records.
+        """
+        tracks = {arm: _Track(phases) for arm, phases in cycles.items()}
+        report = RunReport({arm: ArmReport() for arm in cycles}, {}, max(track.steps for track in tracks.values()) * SERVO_S)
+        fine = False
+        for step in range(1, max(track.steps for track in tracks.values()) + 1):
+            for arm, track in tracks.items():
+                if step <= track.steps:
+                    self.arms[arm].aim(track.joints_rad[step - 1], track.velocity_rad_s[step], track.gripper_mm[step])
+                elif step == track.steps + 1:
+                    self._hold(arm, track)
+            if fine != (bool(self._holding) or any(track.touches_pin(step) for track in tracks.values())):
+                fine = not fine
+                self.engine.pace(FINE if fine else COARSE)
+            self.engine.advance(SERVO_S)
+            for arm, track in tracks.items():
+                self._watch_grasp(arm, track, step, report.arms[arm])
+            if step % _CONTROL_STEPS == 0:
+                self._observe(report, on_step)
+        for arm, track in tracks.items():
+            self._hold(arm, track)
+        self.settle()
+        return report
+
+    def _hold(self, arm: int, track: _Track) -> None:
+        self.arms[arm].aim(track.joints_rad[-1], np.zeros(5), track.gripper_mm[-1])
+
+    def _watch_grasp(self, arm: int, track: _Track, step: int, report: ArmReport) -> None:
+        if step == track.closed_at:
+            report.grasped = self.held(arm)
+            if report.grasped:
+                self._holding.add(arm)
+                if self.grasp == "constraint":
+                    self._bonds[arm] = self._bond(arm)
+        elif step == track.opens_at:
+            report.kept = self.held(arm)
+            self._holding.discard(arm)
+            if arm in self._bonds:
+                pybullet.removeConstraint(self._bonds.pop(arm), physicsClientId=self.engine.client)
+
+    def _bond(self, arm: int) -> int:
+        """A rigid joint between the hand and the block as they are now."""
+        client, hand = self.engine.client, self.arms[arm].hand
+        at, turned = pybullet.getLinkState(self.arms[arm].body, hand, physicsClientId=client)[:2]
+        block = pybullet.getBasePositionAndOrientation(self.block.body, physicsClientId=client)
+        in_hand = pybullet.multiplyTransforms(*pybullet.invertTransform(at, turned), *block)
+        return int(
+            pybullet.createConstraint(
+                self.arms[arm].body,
+                hand,
+                self.block.body,
+                -1,
+                pybullet.JOINT_FIXED,
+                [0, 0, 0],
+                in_hand[0],
+                [0, 0, 0],
+                in_hand[1],
+                physicsClientId=client,
+            )
+        )
+
+    def _observe(self, report: RunReport, on_step: Callable[[], None] | None) -> None:
+        for arm in self._holding:
+            report.arms[arm].trace_rad.append(self.arms[arm].joints_rad())
+        for name, touch in self.collisions().items():
+            report.collisions.setdefault(name, touch)
+        if on_step is not None:
+            on_step()
+
+    @staticmethod
+    def _note(found: dict[str, Touch], name: str, touches: Sequence[Touch]) -> None:
+        real = [touch for touch in touches if touch.distance_mm <= 0]
+        if real:
+            found[name] = min(real, key=lambda touch: touch.distance_mm)
+
+
+def _table(engine: Engine) -> int:
+    half, thick = length(1000.0), length(50.0)
+    client = engine.client
+    shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=[half, half, thick], physicsClientId=client)
+    look = pybullet.createVisualShape(
+        pybullet.GEOM_BOX, halfExtents=[half, half, thick], rgbaColor=[0.93, 0.93, 0.91, 1], physicsClientId=client
+    )
+    body = int(pybullet.createMultiBody(0, shape, look, [0, 0, -thick], physicsClientId=client))
+    engine.coat(body, [-1], _TABLE)
+    return body

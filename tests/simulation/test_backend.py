@@ -1,0 +1,76 @@
+"""The backend's protocol: what an execution says, and why it fails."""
+
+import math
+
+import numpy as np
+import pytest
+
+from marl_handover.envs.backends import make_backend
+from marl_handover.envs.cycle_check import Refusal
+from marl_handover.motion.planner import MotionPlanner
+from marl_handover.simulation.backend import BulletBackend
+
+
+@pytest.fixture
+def backend(model, motion):
+    backend = BulletBackend(model, motion)
+    yield backend
+    backend.close()
+
+
+@pytest.fixture(scope="module")
+def planner(model, motion):
+    return MotionPlanner(model, motion)
+
+
+def test_planned_transfers_succeed_one_after_the_other(backend, planner, motion, expected):
+    parked = np.radians(motion.parked_deg)
+    pose = backend.reset(np.array([30.0, -15.0, 0.3]), 0)
+    for arm, place in ((0, (-70.0, 10.0)), (1, (60.0, -30.0))):
+        joints = backend.joints_rad()[arm] * (1, 1, 1, 1, 0)
+        plan = planner.cycle(arm, pose[:2], place, joints, parked)
+        done = backend.execute(arm, plan.paths)
+        wanted = expected(arm, pose, place)
+        assert done.refusal is None
+        assert np.hypot(*(done.pose - wanted)[:2]) < 2
+        assert abs(math.remainder(done.pose[2] - wanted[2], 2 * math.pi)) < math.radians(1.2)
+        assert done.path_mm == pytest.approx(plan.path_length_mm, rel=0.02)
+        np.testing.assert_allclose(done.joints_rad, np.tile(parked, (2, 1)), atol=math.radians(0.2))
+        pose = done.pose
+
+
+def test_senseless_cycles_are_refused_and_nothing_moves(backend, planner, motion):
+    parked = np.radians(motion.parked_deg)
+    pose = backend.reset(np.array([30.0, -15.0, 0.3]), 0)
+    paths = planner.cycle(0, (40.0, -15.0), (-70.0, 10.0), parked, parked).paths
+    assert backend.execute(0, paths).refusal == Refusal.OBJECT_ELSEWHERE
+    broken = paths._replace(transfer=np.full_like(paths.transfer, np.nan))
+    assert backend.execute(0, broken).refusal == Refusal.NOT_FINITE
+    assert np.array_equal(backend.cell.object_pose(), pose)
+
+
+def test_a_missed_grasp_is_named_and_the_arm_parks(backend, cycle, motion):
+    backend.reset(np.array([100.0, -120.0, 0.0]), 0)
+    done = backend.carry_out(0, cycle(0, (-30.0, -25.0), (60.0, -10.0)))
+    assert done.refusal == Refusal.MISSED_GRASP
+    np.testing.assert_allclose(done.joints_rad[0], np.radians(motion.parked_deg), atol=math.radians(0.2))
+
+
+def test_a_block_let_go_on_the_way_is_dropped(backend, cycle):
+    backend.reset(np.array([30.0, -15.0, 0.0]), 0)
+    phases = list(cycle(0, (30.0, -15.0), (-60.0, -5.0)))
+    opening = np.linspace(0, 12, len(phases[3].t_s))
+    phases[3] = phases[3].__class__("transfer", phases[3].t_s, phases[3].joints_rad, opening)
+    phases[4] = phases[4].__class__("lower", phases[4].t_s, phases[4].joints_rad, np.full(len(phases[4].t_s), 12.0))
+    assert backend.carry_out(0, tuple(phases)).refusal in (Refusal.DROPPED, Refusal.COLLISION)
+
+
+def test_it_is_found_by_name(model, motion):
+    from marl_handover.config import TaskConfig
+
+    backend = make_backend("bullet", model, TaskConfig(), motion, grasp="constraint", size=(64, 36))
+    assert isinstance(backend, BulletBackend)
+    assert not backend.exact
+    backend.reset(np.zeros(3), 3)
+    assert backend.render().shape == (36, 64, 3)
+    backend.close()
