@@ -112,7 +112,7 @@ class MotionConfig:
     lift_mm: float = 40.0  # how high the block travels above the pick height, far from both ends
     lift_scale_mm: float = 25.0  # how fast, in horizontal distance from an end, that height is asked for; shorter ways: all in scale
     approach_scale_mm: float = 10.0  # the same for an empty hand that comes to the pin or leaves it
-    control_points: int = 9  # of each path's spline
+    control_points: int = 11  # of each path's spline
     degree: int = 5
     starts: int = 16  # first guesses tried at most
     velocity_share: float = 0.8  # of the URDF's joint velocities
@@ -174,7 +174,7 @@ class LoopConfig:
     """The closed loop on arms that are not exact."""
 
     transfers: int = 30  # allowed an episode, picking up again after a miss included
-    chart_inset: float = 0.95  # hand-overs keep to this part of the chart, or to the cell's own part if that is smaller
+    chart_inset: float = 0.99  # hand-overs keep to this part of the chart, or to the cell's own part if that is smaller
     edge_mm: float = 1.0  # an object this far outside all reach is taken for one at the edge: the fingers close on its pin all the same
 
     def validate(self) -> None:

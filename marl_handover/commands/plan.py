@@ -36,6 +36,8 @@ class PlanConfig:
     seed: int = 0  # of policy=random
     json: str = ""  # file for the sequence
     picture: str = ""  # file for a picture of the sequence: .png, .pdf or .svg
+    motion: str = ""  # file for the arms' motions: timed joint trajectories of every transfer
+    motion_picture: str = ""  # file for a picture of them: .png, .pdf or .svg
 
 
 SCHEMA: type = PlanConfig
@@ -47,8 +49,9 @@ def run(config: PlanConfig) -> int:
     """Solve, print, write. Raises :class:`WorkFailed` if the policy does not reach the goal."""
     from marl_handover.report.files import require_picture, save_figure, write_json
 
-    if config.picture:
-        require_picture("picture", config.picture)
+    for name in ("picture", "motion_picture"):
+        if getattr(config, name):
+            require_picture(name, getattr(config, name))
     require_seed(config.seed)
     poses = {name: _pose(name, getattr(config, name)) for name in ("start", "goal")}
     policy = _policy(config)
@@ -60,6 +63,8 @@ def run(config: PlanConfig) -> int:
             raise OutOfReach(name, (float(pose[0]), float(pose[1])), rules.cell.r_min_mm, rules.cell.r_max_mm)
     plan = solve(policy, poses["start"], poses["goal"])
     print(_text(plan, rules))
+    if config.motion or config.motion_picture:
+        _move(config, plan, rules)  # first: if there is no motion, nothing is written
     if config.json:
         write_json(Path(config.json), plan, "json")
     if config.picture:
@@ -69,6 +74,35 @@ def run(config: PlanConfig) -> int:
     if plan["outcome"] != Outcome.SUCCESS.name.lower():
         raise WorkFailed(f"policy {policy.name!r} did not reach the goal: {plan['outcome']} after {counted(len(plan['transfers']))}")
     return 0
+
+
+def _move(config: PlanConfig, plan: dict[str, Any], rules: Rules) -> None:
+    """Plan the motion of every transfer that was not refused, say what it is, and write it as file and picture.
+
+    Raises:
+        NoMotion: if one of them has no collision-free motion; then nothing is written.
+    """
+    # The planner is imported here: without motions, this command needs no compiled functions.
+    from marl_handover.cell import build_cell
+    from marl_handover.motion.planner import MotionPlanner
+    from marl_handover.report.files import save_figure, write_json
+    from marl_handover.runtime.motions import motion_row, plan_motions
+
+    planner = MotionPlanner(build_cell(rules.cell.config))
+    done = [transfer for transfer in plan["transfers"] if not transfer["refused"]]
+    orders = [(ARM_LETTERS.index(t["arm"]), np.array(t["from"][:2]), np.array(t["to"][:2])) for t in done]
+    motions = plan_motions(planner, orders)
+    for number, motion in enumerate(motions, start=1):
+        print(
+            f"motion {number}: arm {ARM_LETTERS[motion.arm]}, {motion.duration_s:.2f} s, grip path {motion.path_length_mm:.1f} mm, "
+            f"clearance {motion.min_clearance_mm:.1f} mm, planned in {motion.planning_ms:.1f} ms"
+        )
+    if config.motion:
+        write_json(Path(config.motion), {"transfers": [motion_row(motion) for motion in motions]}, "motion")
+    if config.motion_picture:
+        from marl_handover.report.motion import motion_figure
+
+        save_figure(motion_figure(motions, planner.model, planner.motion), Path(config.motion_picture), "motion_picture")
 
 
 def solve(policy: SupervisorPolicy, start: Floats, goal: Floats) -> dict[str, Any]:

@@ -148,6 +148,7 @@ def _episodes(
     with tqdm(total=config.episodes, unit="episode", disable=not config.progress, leave=False) as bar:
         for episode in range(config.episodes):
             env.reset(seed=config.seed if episode == 0 else None, options=problem or None)
+            backend.cell.show_goal(env.observe("supervisor")["goal"])
             if frames is not None:
                 frames.add(backend.render())
             yield play(env, supervisor, arms, backend, lambda line: bar.write(line))
@@ -180,7 +181,7 @@ def play(
         came = "done" if refusal is None else f"{refusal}{_reason(arms[agent])}"
         rate = seconds / (time.perf_counter() - started)
         say(
-            f"  {ARM_LETTERS[arms[agent].arm]} to {np.round(observation['target'], 1).tolist()}: {came}; "
+            f"  {ARM_LETTERS[arms[agent].arm]} to ({observation['target'][0]:.1f} mm, {observation['target'][1]:.1f} mm): {came}; "
             f"object {_pose(backend.cell.object_pose())}; {seconds:.1f} s, {rate:.1f} x real time"
         )
     outcome = str(env.infos["supervisor"]["outcome"])

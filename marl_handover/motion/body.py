@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
 from marl_handover.cell.collision import Capsule, capsule_pairs, joints_before
-from marl_handover.cell.kinematics import ArmModel
+from marl_handover.cell.kinematics import ArmModel, transform
 from marl_handover.config import BlockConfig, MotionConfig
-from marl_handover.motion.kernels import can_meet
+from marl_handover.motion.kernels import can_meet, world_shapes
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -110,15 +110,22 @@ def block_capsules(block: BlockConfig, grip_to_table_mm: float) -> list[Capsule]
     return [*shapes, Capsule("pin", (0.0, 0.0, bottom), (0.0, 0.0, top), pin)]
 
 
-def standing_arm(arm: ArmModel, motion: MotionConfig, q: Floats, T_arm_other: Floats) -> Floats:
-    """Obstacle rows (M, 9) of another arm of the same kind that holds still at ``q`` (5,), in the frame of the moving arm's base."""
+def standing_arm(body: ArmBody, arm: ArmModel, motion: MotionConfig, q: Floats, x_mm: float, y_mm: float, facing_rad: float) -> Floats:
+    """Obstacle rows (M, 9) of another arm of the same kind that holds still at ``q`` (5,), its base at a pose in the moving arm's frame."""
+    bare = body.capsules
+    if q[4] == 0.0:
+        shapes = world_shapes(q[None, :4].copy(), body.planar, bare, x_mm, y_mm, facing_rad)[0]
+        rows = np.empty((len(bare), 9))
+        rows[:, :6], rows[:, 6], rows[:, 7], rows[:, 8] = shapes[:, :6], shapes[:, 10], motion.arm_clearance_mm, shapes[:, 9]
+        return rows
     frames = arm.link_transforms(q, motion.finger_travel_mm)
-    rows = []
+    T = transform((x_mm, y_mm, 0.0), (0.0, 0.0, facing_rad))
+    listed = []
     for shape in capsule_pairs(arm.description)[0]:
-        T = T_arm_other @ frames[shape.link]
-        ends = [T[:3, :3] @ np.array(end) + T[:3, 3] for end in (shape.start_mm, shape.end_mm)]
-        rows.append([*ends[0], *ends[1], shape.radius_mm, motion.arm_clearance_mm])
-    return _with_half_lengths(rows, 0)
+        M = T @ frames[shape.link]
+        ends = [M[:3, :3] @ np.array(end) + M[:3, 3] for end in (shape.start_mm, shape.end_mm)]
+        listed.append([*ends[0], *ends[1], shape.radius_mm, motion.arm_clearance_mm])
+    return _with_half_lengths(listed, 0)
 
 
 def standing_block(model: CellModel, motion: MotionConfig, place_mm: Floats) -> Floats:

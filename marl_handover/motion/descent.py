@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from marl_handover.motion.objective import LEVER_MM, Price, columns, lagrangian
-from marl_handover.motion.scene import Scene
+from marl_handover.motion.scene import FAST, Scene
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class Sampled(NamedTuple):
     values: Floats
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def descend(points: Floats, spline: Spline, scene: Scene, weights: Floats, effort: Effort) -> tuple[Floats, float, int]:
     """Improve control points (N, 4), ends fixed.
 
@@ -68,8 +68,9 @@ def descend(points: Floats, spline: Spline, scene: Scene, weights: Floats, effor
     held = Held(np.zeros((S, C)), np.zeros((n, 4, 2)))
     now = Sampled(np.empty((S, 4)), np.empty((S, 4)), np.empty((S, C)))
     x, rho, evaluations, before, worst = points.copy(), effort.penalty, 0, np.inf, np.inf
+    H = spline.metric.copy()
     for _ in range(effort.rounds):
-        x, cost, used = _minimise(x, rho, held, now, spline, scene, weights, effort)
+        x, cost, used = _minimise(x, rho, held, now, spline, scene, weights, effort, H)
         evaluations += used
         worst, paid = _take_over(x, now.values, held, rho, spline.limits)
         cost -= paid
@@ -80,14 +81,14 @@ def descend(points: Floats, spline: Spline, scene: Scene, weights: Floats, effor
     return x, worst, evaluations
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def _minimise(
-    x: Floats, rho: float, held: Held, now: Sampled, spline: Spline, scene: Scene, weights: Floats, effort: Effort
+    x: Floats, rho: float, held: Held, now: Sampled, spline: Spline, scene: Scene, weights: Floats, effort: Effort, H: Floats
 ) -> tuple[Floats, float, int]:
-    """One round of BFGS at fixed multipliers; ``now`` ends as the evaluation of what is returned."""
+    """One round of BFGS at fixed multipliers; ``now`` ends as the evaluation of what is returned, ``H`` goes on to the next round."""
     n = x.shape[0] - 2
     f, g = _evaluate(x, rho, held, now, spline, scene, weights)
-    H, evaluations = spline.metric.copy(), 1
+    evaluations = 1
     for _ in range(effort.steps):
         d = -_times(H, g)
         slope = np.dot(d, g)
@@ -116,7 +117,7 @@ def _minimise(
     return x, f, evaluations
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def _update(H: Floats, s: Floats, y: Floats) -> None:
     """The BFGS update of an inverse Hessian, in place; left out where the curvature is not positive."""
     sy = np.dot(s, y)
@@ -129,7 +130,7 @@ def _update(H: Floats, s: Floats, y: Floats) -> None:
             H[a, b] += factor * s[a] * s[b] - (Hy[a] * s[b] + s[a] * Hy[b]) / sy
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def _evaluate(x: Floats, rho: float, held: Held, now: Sampled, spline: Spline, scene: Scene, weights: Floats) -> tuple[float, Floats]:
     """The augmented Lagrangian at control points ``x`` (N, 4) and its gradient over the inner ones, flat."""
     B, limits, Q, grad, limit = spline.B, spline.limits, now.Q, now.grad, held.limit
@@ -157,7 +158,7 @@ def _evaluate(x: Floats, rho: float, held: Held, now: Sampled, spline: Spline, s
     return f, g.reshape(4 * n)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def _times(H: Floats, v: Floats) -> Floats:
     """The product of a symmetric matrix with a vector."""
     out = np.zeros(len(v))
@@ -167,7 +168,7 @@ def _times(H: Floats, v: Floats) -> Floats:
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def _take_over(x: Floats, values: Floats, held: Held, rho: float, limits: Floats) -> tuple[float, float]:
     """Take over the multipliers; the greatest violation in mm, and what the penalty was."""
     worst, paid, lam, limit = 0.0, 0.0, held.lam, held.limit

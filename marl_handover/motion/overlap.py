@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marl_handover.motion.kernels import FAR_MM, beyond, nearest, pivots, place_capsules
+from marl_handover.motion.kernels import FAR_MM, beyond, nearest, world_shapes
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import Phase, TransferMotion
 
@@ -103,30 +103,13 @@ def _placed(planner: MotionPlanner, motion: TransferMotion, step: float) -> tupl
     bare, held = len(planner.body.capsules), len(planner.body.held)
     counts = np.where(np.isin(names[at], LOADED), held, bare)
     base = planner.model.cell.bases[motion.arm]
-    shapes = _shapes(joints, planner.body.planar, planner.body.held, base.x_mm, base.y_mm, base.facing_rad)
+    shapes = world_shapes(joints, planner.body.planar, planner.body.held, base.x_mm, base.y_mm, base.facing_rad)
     return shapes, counts
 
 
 def _end_of(phases: Sequence[Phase], name: str) -> float:
     """When a phase of a cycle ends, from the cycle's start on."""
     return float(next(phase for phase in phases if phase.name == name).t_s[-1] - phases[0].t_s[0])
-
-
-@njit(cache=True, nogil=True)
-def _shapes(joints: Floats, planar: Floats, capsules: Floats, x: float, y: float, facing: float) -> Floats:
-    """Placed segments (S, K, 11) in the world, radius last."""
-    S, K = joints.shape[0], capsules.shape[0]
-    out, frames, ends = np.empty((S, K, 11)), np.empty((1, 5, 4)), np.empty((K, 10))
-    for i in range(S):
-        pivots(planar, joints, i, frames, 0)
-        place_capsules(capsules, frames, 0, ends)
-        c, s = math.cos(joints[i, 0] + facing), math.sin(joints[i, 0] + facing)
-        for k in range(K):
-            for e in range(0, 9, 3):
-                r, t = ends[k, e], ends[k, e + 1]
-                out[i, k, e], out[i, k, e + 1], out[i, k, e + 2] = x + c * r - s * t, y + s * r + c * t, ends[k, e + 2]
-            out[i, k, 9], out[i, k, 10] = ends[k, 9], capsules[k, 7]
-    return out
 
 
 @njit(cache=True, nogil=True)

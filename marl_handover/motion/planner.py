@@ -19,7 +19,7 @@ from marl_handover.errors import InvalidSetting, NotFinite
 from marl_handover.motion.body import arm_body, ball_around, standing_arm, standing_block
 from marl_handover.motion.scene import Scene
 from marl_handover.motion.segment import FoundPath, Segment, find_path
-from marl_handover.motion.starts import carrying_starts, reaching_starts
+from marl_handover.motion.starts import GRIP_LEAST_MM, SAMPLES, carrying_starts, reaching_starts
 from marl_handover.motion.trajectory import CyclePaths, OutOfArmsReach, TransferMotion
 
 Floats = NDArray[np.float64]
@@ -104,7 +104,7 @@ class MotionPlanner:
         """The path of the loaded hand from pick to place (world, mm). Raises as :meth:`cycle`."""
         segment, guesses = self.carrying(arm, pick_mm, place_mm, other_joints_rad)
         if math.dist(pick_mm, place_mm) < STILL_MM:
-            guesses = iter([np.repeat(segment.ends[:1], 33, axis=0)])
+            guesses = iter([np.linspace(segment.ends[0], segment.ends[1], SAMPLES)])
         return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.starts)
 
     def carrying(self, arm: int, pick_mm: Floats, place_mm: Floats, other_joints_rad: Floats) -> tuple[Segment, Iterator[Floats]]:
@@ -118,7 +118,8 @@ class MotionPlanner:
         profile = np.array([*ends_mm[0], *ends_mm[1], scale, scale, lift_mm, share * self.motion.ground_clearance_mm])
         others = self._other(arm, other_joints_rad)
         bound = string_length(distance, scale, lift_mm)
-        segment = Segment(self.body, self._scene(True, others, len(others), profile), ends, bound)
+        expected = bound + detour_length(ends_mm, GRIP_LEAST_MM)
+        segment = Segment(self.body, self._scene(True, others, len(others), profile), ends, bound, expected)
         return segment, carrying_starts(self.body, ends, ends_mm, self.pick_height_mm, lift_mm)
 
     def reach(self, arm: int, joints_rad: Floats, pin_mm: Floats, other_joints_rad: Floats, *, leaving: bool) -> FoundPath:
@@ -140,7 +141,7 @@ class MotionPlanner:
         profile = np.array([*pin, *pin, *scales, self.motion.lift_mm, self.motion.ground_clearance_mm])
         others = self._other(arm, other_joints_rad)
         obstacles = np.concatenate([others, standing_block(self.model, self.motion, pin)])
-        segment = Segment(self.body, self._scene(False, obstacles, len(others), profile), ends, 0.0)
+        segment = Segment(self.body, self._scene(False, obstacles, len(others), profile), ends, 0.0, 0.0)
         return segment, reaching_starts(self.body, ends, np.array([*pin, self.pick_height_mm]), self.motion.lift_mm, not leaving)
 
     def grasp_joints(self, arm: int, what: str, position_mm: Floats) -> Floats:
@@ -178,10 +179,8 @@ class MotionPlanner:
             if index == arm:
                 continue
             turn = base.facing_rad - bases[arm].facing_rad
-            T = np.eye(4)
-            T[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
-            T[:2, 3] = self.in_base(arm, np.array([base.x_mm, base.y_mm]))
-            rows.append(standing_arm(self.model.arm, self.motion, joints_rad, T))
+            x_mm, y_mm = self.in_base(arm, np.array([base.x_mm, base.y_mm]))
+            rows.append(standing_arm(self.body, self.model.arm, self.motion, joints_rad, float(x_mm), float(y_mm), turn))
         self._standing = (key, np.concatenate(rows))
         return self._standing[1]
 
@@ -206,6 +205,20 @@ def string_length(distance_mm: float, scale_mm: float, lift_mm: float) -> float:
             hull.pop()
         hull.append(i)
     return float(np.hypot(np.diff(s[hull]), np.diff(z[hull])).sum())
+
+
+def detour_length(ends_mm: Floats, radius_mm: float) -> float:
+    """How much longer than the straight line between ``ends_mm`` (2, 2) a taut string around a disc at the origin is, in mm."""
+    a, b = ends_mm
+    distance, (r_a, r_b) = math.dist(a, b), np.hypot(ends_mm[:, 0], ends_mm[:, 1])
+    if distance == 0.0 or min(r_a, r_b) <= radius_mm:
+        return 0.0
+    foot = a + float(np.clip(-a @ (b - a) / distance**2, 0.0, 1.0)) * (b - a)
+    if math.hypot(*foot) >= radius_mm:
+        return 0.0
+    around = abs(math.atan2(a[0] * b[1] - a[1] * b[0], a @ b)) - math.acos(radius_mm / r_a) - math.acos(radius_mm / r_b)
+    tangents = math.sqrt(r_a**2 - radius_mm**2) + math.sqrt(r_b**2 - radius_mm**2)
+    return tangents + radius_mm * max(around, 0.0) - distance
 
 
 def _turns_left(s: Floats, z: Floats, a: int, b: int, c: int) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -25,20 +25,26 @@ SAMPLES, CROWDING = 41, 0.6
 WEIGHTS = np.array([0.1, 0.005])
 """Of even speed and of joint motion, beside the length: enough to leave no direction without curvature."""
 
-EFFORT = Effort(penalty=0.3, growth=6.0, rounds=5, steps=30, gain=1e-4, slack_mm=0.2)
+EFFORT = Effort(penalty=0.1, growth=10.0, rounds=5, steps=30, gain=1e-4, slack_mm=0.2)
 
+ALIKE_RAD = 1e-3
 SHORTEST_MM = 20.0
 """Paths between nearer ends are bent as if they were this long."""
 
-FIRST_MARGINS_MM = np.array([0.5, 0.5, 0.5, 0.2, 0.05])
+FIRST_MARGINS_MM = np.array([0.5, 0.5, 0.5, 0.25, 0.1])
 """What the optimiser asks beyond the demand at its few samples: arm and block, itself, ground, lift, edge."""
 
-REPAIRS = 3
-HOPELESS_MM = -6.0
-GOOD_RATIO = 1.02
-"""A path this near to the lower bound of its length is not searched on."""
+PATIENCE = 1000
+"""Once there is a feasible path, no further start begins after so many evaluations."""
 
-WANTED, FAIR_RATIO = 2, 1.08
+REPAIRS, GIVEN_UP = 6, 2
+HOPELESS_MM = -1.0
+"""A path that the dense check finds short is repaired; after so many repairs only one that is short by less than this."""
+
+GOOD_RATIO = 1.03
+"""A path this near to its expected length is not searched on."""
+
+WANTED, FAIR_RATIO = 2, 1.15
 """Feasible paths to choose from where none is that good; one more where none is even fair."""
 
 
@@ -65,12 +71,14 @@ class Segment:
         scene: what the path is judged against.
         ends: (2, 4) joints at start and end, roll left out, in rad.
         lower_bound_mm: no path is shorter.
+        expected_mm: what the length is likely to be at best; paths near it are not searched on.
     """
 
     body: ArmBody
     scene: Scene
     ends: Floats
     lower_bound_mm: float
+    expected_mm: float
 
     def check(self, joints: Floats) -> tuple[Margins, float]:
         """Margins and length in mm of joint samples (S, 4)."""
@@ -97,7 +105,7 @@ class Segment:
 def find_path(
     segment: Segment, guesses: Iterable[Floats], control_points: int, degree: int, starts: int, wanted: int = WANTED
 ) -> FoundPath:
-    """The shortest of a few feasible paths; of the first one that is near its lower bound.
+    """The shortest of a few feasible paths; of the first one that is near its expected length.
 
     Args:
         segment: what is asked.
@@ -116,50 +124,57 @@ def find_path(
     fitted_guesses: list[Floats] = []
     supply = iter(guesses)
     for start in range(starts):
-        samples = next(supply, None)
-        if samples is not None:
-            fitted_guesses.append(fitted(samples, segment.body.limits, control_points, degree))
-            points = fitted_guesses[-1]
-        else:
-            points = bent(fitted_guesses[start % len(fitted_guesses)], segment.body.limits, degree, start)
-        found, margins, used = attempt(segment, points, degree)
+        points = _next_start(supply, fitted_guesses, segment.body.limits, control_points, degree, start)
+        found, margins, used = attempt(segment, points, degree, beat_mm=np.inf if best is None else best.length_mm)
         evaluations += used
         if found is None:
             miss = max(miss, margins, key=lambda m: m.worst)
+        else:
+            feasible += 1
+            best = found if best is None or found.length_mm < best.length_mm else best
+        if best is None:
             continue
-        feasible += 1
-        if best is None or found.length_mm < best.length_mm:
-            best = found
-        ratio = best.length_mm / max(segment.lower_bound_mm, 1e-9)
-        if ratio <= GOOD_RATIO or feasible >= wanted + (wanted > 1 and ratio > FAIR_RATIO):
+        ratio = best.length_mm / max(segment.expected_mm, 1e-9)
+        if ratio <= GOOD_RATIO or feasible >= wanted + (wanted > 1 and ratio > FAIR_RATIO) or evaluations > PATIENCE:
             break
     if best is None:
         raise NoPath("path", _named(miss), -miss.worst, starts)
     return best._replace(starts=start + 1, evaluations=evaluations)
 
 
-def attempt(segment: Segment, points: Floats, degree: int, effort: Effort = EFFORT) -> tuple[FoundPath | None, Margins, int]:
-    """One start: descend, check densely, ask for more where it fell short, descend again."""
+def _next_start(supply: Iterator[Floats], before: list[Floats], limits: Floats, control_points: int, degree: int, seed: int) -> Floats:
+    """Control points of the next guess that is unlike the ones ``before``, to which it is added; when there is none, of a bend of one."""
+    for samples in supply:
+        points = fitted(samples, limits, control_points, degree)
+        if not any(np.abs(points - other).max() < ALIKE_RAD for other in before):
+            before.append(points)
+            return points
+    return bent(before[seed % len(before)], limits, degree, seed)
+
+
+def attempt(
+    segment: Segment, points: Floats, degree: int, effort: Effort = EFFORT, beat_mm: float = np.inf
+) -> tuple[FoundPath | None, Margins, int]:
+    """One start: descend, check densely, ask for more where it fell short, descend again.
+
+    Gives up on a path that gets longer than ``beat_mm``, and on one that repairs do not help.
+    """
     asked, evaluations = FIRST_MARGINS_MM.copy(), 0
     dense = np.array(sampled_basis(DENSE_SAMPLES, len(points), degree))
-    for _ in range(REPAIRS):
+    low, high = segment.body.limits.T
+    for repair in range(REPAIRS):
         points, used = segment.improve(points, degree, asked, effort)
+        points[1:-1] = np.clip(points[1:-1], low, high)  # what the descent leaves over is small; inside them, the whole path is
         evaluations += used
         margins, length = segment.check(dense @ points)
-        if margins.worst >= 0.0 and within(points, segment.body.limits):
+        if margins.worst >= 0.0:
             full = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
             return FoundPath(full, length, margins, 1, evaluations), margins, evaluations
-        if margins.worst < HOPELESS_MM:
+        if length >= beat_mm or (repair + 1 >= GIVEN_UP and margins.worst < HOPELESS_MM):
             break
         short = np.array([min(margins.arm, margins.block), margins.itself, margins.ground, margins.lift, margins.edge])
-        asked = np.minimum(asked + np.where(short < -ROUNDING_MM, 0.05 - 1.3 * short, 0.0), MARGIN_MM)
-        points = np.concatenate([points[:1], np.clip(points[1:-1], segment.body.limits[:, 0], segment.body.limits[:, 1]), points[-1:]])
+        asked = np.minimum(asked + np.where(short < -ROUNDING_MM, 0.1 - 1.3 * short, 0.0), MARGIN_MM)
     return None, margins, evaluations
-
-
-def within(points: Floats, limits: Floats) -> bool:
-    """Whether the inner control points (N, 4) are within the joint limits; then the path is."""
-    return bool(((points[1:-1] >= limits[:, 0]) & (points[1:-1] <= limits[:, 1])).all())
 
 
 def refuse_bad_ends(segment: Segment) -> None:

@@ -122,6 +122,26 @@ def _beads_mm(config: BlockConfig) -> Floats:
     return np.linspace(highest, lowest, max(2, math.ceil((highest - lowest) / _BEAD_SPACING_MM) + 1))
 
 
+def draw_goal(engine: Engine, config: BlockConfig, pose: Floats) -> None:
+    """A flat square with a red bar towards +x at ``pose`` (3,), to be seen only."""
+    half, bar = config.side_mm / 2, config.marker_mm / 2
+    thin = length(0.3)
+    shape = pybullet.createVisualShapeArray(
+        shapeTypes=[pybullet.GEOM_BOX] * 2,
+        halfExtents=[[length(half), length(half), thin], [length(bar * 0.25), length(bar * 0.8), 1.5 * thin]],
+        visualFramePositions=[[0, 0, 0], [length(bar * 0.6), 0, 0]],
+        rgbaColors=[[0.45, 0.75, 0.45, 1], [0.84, 0.15, 0.16, 1]],
+        physicsClientId=engine.client,
+    )
+    pybullet.createMultiBody(
+        baseMass=0,
+        baseVisualShapeIndex=shape,
+        basePosition=[length(pose[0]), length(pose[1]), thin],
+        baseOrientation=pybullet.getQuaternionFromEuler([0.0, 0.0, float(pose[2])]),
+        physicsClientId=engine.client,
+    )
+
+
 def _mass_properties(config: BlockConfig) -> tuple[float, float, tuple[float, float, float]]:
     """Mass in kg, height of the centre of mass in mm, and the principal moments in kg mm^2 about it, of solid wood."""
     side, height, radius, pin = config.side_mm, config.height_mm, config.pin_diameter_mm / 2, config.pin_top_mm - config.height_mm

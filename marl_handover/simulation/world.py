@@ -16,7 +16,7 @@ from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig, require_choice
 from marl_handover.motion.trajectory import Phase
 from marl_handover.simulation.arm import SERVO_S, SimulatedArm
-from marl_handover.simulation.block import Block
+from marl_handover.simulation.block import Block, draw_goal
 from marl_handover.simulation.camera import TOP, Camera, Pixels, picture
 from marl_handover.simulation.engine import COARSE, FINE, Engine, Floats, Surface, Touch, length
 
@@ -124,6 +124,10 @@ class BulletCell:
     def settle(self, seconds: float = _SETTLE_S) -> None:
         """Let time pass while every servo holds its last set-point."""
         self.engine.advance(seconds)
+
+    def show_goal(self, pose: ArrayLike) -> None:
+        """Draw where the block is to go, until the next reset: a flat green square with a red bar, which nothing can touch."""
+        draw_goal(self.engine, self.model.cell.config.block, np.asarray(pose, dtype=float))
 
     def object_pose(self) -> Floats:
         """The block's true pose (3,): x_mm, y_mm, theta_rad."""

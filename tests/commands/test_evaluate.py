@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 
@@ -271,3 +272,72 @@ def test_a_noisy_external_finish_is_traced_as_what_it_was(tmp_path):
     assert {outcome: ends.count(outcome) for outcome in OUTCOMES} == result["outcomes"]
     assert result["outcomes"]["wrong_orientation"] > 0
     assert result["noise"] == {"position_mm": 0.0, "yaw_deg": 8.0}
+
+
+LOOP_FIELDS = {
+    *("success_in_the_end", "ended", "position_error_mm", "orientation_error_deg", "refusals", "transfers", "transfer_error_mm"),
+    *("transfer_error_deg", "planning_ms", "cycle_s", "episode_s", "chart_inset", "position_tolerance_mm"),
+}
+LOOP_TRACE_FIELDS = {"attempt", "refusal", "detail", "planning_ms", "duration_s", "path_mm"}
+
+
+@pytest.mark.parametrize("architecture", ["A", "B"])
+def test_noisy_arms_are_evaluated_in_closed_loop(tmp_path, architecture):
+    result, lines = evaluated(
+        tmp_path, "backend=noisy", "episodes=12", f"architecture={architecture}", "task.noise.yaw_deg=2", "missed_grasps=0.2"
+    )
+    assert set(result) == FIELDS | LOOP_FIELDS | {"symmetry_order", "noise", "missed_grasps"}
+    assert (result["noise"], result["missed_grasps"]) == ({"position_mm": 0.0, "yaw_deg": 2.0}, 0.2)
+    assert result["success_rate"] <= result["success_in_the_end"]
+    assert result["refusals"]["missed_grasp"] > 0
+    first = [line for line in lines if line["attempt"] == 0]
+    assert len(first) == round(result["mean_steps"] * 12)
+    ends = [line["outcome"] for line in first if line["terminated"] or line["truncated"]]
+    assert {kind: ends.count(kind) for kind in OUTCOMES} == result["outcomes"]
+    assert len(lines) == result["transfers"]
+    for before, after in itertools.pairwise(lines):
+        if before["episode"] == after["episode"]:
+            assert after["state"] == before["next_state"]
+            assert after["step"] == before["step"] + 1
+    assert all(set(line) == TRACE_FIELDS | LOOP_TRACE_FIELDS for line in lines)
+
+
+def test_noise_that_was_typed_as_zero_is_zero(tmp_path):
+    quiet = ("task.noise.position_mm=0", "task.noise.yaw_deg=0", "missed_grasps=0")
+    result, _ = evaluated(tmp_path, "backend=noisy", "episodes=2", *quiet)
+    assert result["noise"] == {"position_mm": 0.0, "yaw_deg": 0.0}
+    assert result["transfer_error_mm"]["p95"] < 1e-6
+
+
+def test_the_closed_loop_is_repeatable(tmp_path):
+    def told(*arguments):
+        return [{**line, "planning_ms": 0} for line in evaluated(tmp_path, "backend=noisy", "episodes=2", *arguments)[1]]
+
+    assert told() == told()
+    assert told() != told("seed=1")
+
+
+def test_a_few_problems_in_the_simulated_cell(tmp_path):
+    (tmp_path / "problems.jsonl").write_text("\n".join(problem_lines(1)))
+    result, lines = evaluated(tmp_path, "backend=bullet", "grasp=constraint", f"problems={tmp_path / 'problems.jsonl'}")
+    assert set(result) == FIELDS | LOOP_FIELDS | {"symmetry_order", "grasp"}
+    assert result["success_rate"] == result["success_in_the_end"] == 1.0
+    assert result["transfer_error_mm"]["p95"] <= 2.0
+    assert 0 < max(math.dist(line["next_state"][:2], line["place"]) for line in lines) < 5.0  # measured, not commanded
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["grasp=friction"], "backend=bullet"),
+        (["backend=bullet", "missed_grasps=0.1"], "backend=noisy"),
+        (["backend=bullet", "task.noise.yaw_deg=1"], "task.noise"),
+        (["backend=bullet", "grasp=magnet"], "friction, constraint"),
+        (["backend=noisy", "missed_grasps=2"], "missed_grasps"),
+        (["backend=noisy", "loop.transfers=0"], "loop.transfers"),
+        (["backend=noisy", "motion.lift_mm=nan"], "motion.lift_mm"),
+        (["backend=noisy", "motion.parked_deg=[0,0,0,0,0]"], "motion.parked_deg"),
+    ],
+)
+def test_backends_refuse_what_they_cannot_use(capsys, arguments, word):
+    assert_refused(capsys, ["evaluate", "progress=false", "episodes=2", *arguments], word)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import subprocess
+import sys
 
 import matplotlib.image
 import numpy as np
@@ -145,3 +147,47 @@ def test_a_trained_policy_under_other_settings(policy_file, capsys):
     assert "start (-250, -60) mm is out of every arm's reach" in capsys.readouterr().err
     assert cli.main(["plan", f"policy={policy_file}", "architecture=B"]) == 2
     assert "has architecture = 'A', but 'B' was asked for" in capsys.readouterr().err
+
+
+MOTION_KEYS = {"arm", "from", "to", "phases", "parked_other_rad", "path_length_mm", "min_clearance_mm", "planning_ms"}
+
+
+def test_motions_of_every_transfer(tmp_path, capsys):
+    motion, plan, picture = tmp_path / "new" / "motion.json", tmp_path / "plan.json", tmp_path / "motion.png"
+    assert cli.main(["plan", f"motion={motion}", f"motion_picture={picture}", f"json={plan}"]) == 0
+    out = capsys.readouterr().out
+    transfers, planned = (json.loads(path.read_text())["transfers"] for path in (motion, plan))
+    assert [row["arm"] for row in transfers] == [row["arm"] for row in planned]
+    for row, command in zip(transfers, planned, strict=True):
+        assert set(row) == MOTION_KEYS
+        assert (row["from"], row["to"]) == (command["from"][:2], command["to"][:2])
+        assert all(set(phase) == {"name", "t_s", "joints_rad"} for phase in row["phases"])
+        assert all(len(joints) == 5 for phase in row["phases"] for joints in phase["joints_rad"])
+    assert out.count("motion ") == len(transfers) == 4
+    assert colours(picture) > 50
+
+
+def test_a_policy_that_fails_has_motions_of_what_was_not_refused(tmp_path):
+    motion, plan = tmp_path / "motion.json", tmp_path / "plan.json"
+    assert cli.main(["plan", "policy=random", "architecture=A", "epsilon_deg=0.001", f"motion={motion}", f"json={plan}"]) == 1
+    made = [row for row in json.loads(plan.read_text())["transfers"] if not row["refused"]]
+    assert [row["from"] for row in json.loads(motion.read_text())["transfers"]] == [row["from"][:2] for row in made]
+
+
+def test_a_transfer_without_a_motion_is_one_line_and_nothing_is_written(tmp_path, capsys):
+    """A block so wide that it hits the arm that holds it."""
+    names = {"motion": "m.json", "motion_picture": "m.png", "json": "p.json", "picture": "p.png"}
+    assert cli.main(["plan", "cell.block.side_mm=250", *(f"{key}={tmp_path / name}" for key, name in names.items())]) == 1
+    assert capsys.readouterr().err.startswith("marl-handover plan: transfer 1, arm R, has no motion: the start pose is ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_motions_are_planned_only_when_asked_for():
+    code = "import sys; from marl_handover import cli; cli.main(['plan']); print('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()[-1] == "False"
+
+
+@pytest.mark.parametrize("argument", ["motion_picture=motion.gif", "motion=/proc/nowhere/motion.json"])
+def test_a_motion_file_that_cannot_be_is_bad_input(capsys, argument):
+    assert cli.main(["plan", argument]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -17,6 +17,7 @@ from marl_handover.errors import CorruptFile, MissingFile
 from marl_handover.motion import cost
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import adapted, load
+from marl_handover.resources import package_path
 from marl_handover.task.rules import Rules, straight_line_mm
 
 MOTION = MotionConfig()
@@ -37,6 +38,11 @@ def transfers(cell: Cell, count: int, seed: int) -> tuple[np.ndarray, np.ndarray
 @pytest.fixture(scope="module")
 def table(paper):
     return cost.cost_table(paper, MOTION)
+
+
+def test_the_shipped_table_is_that_of_the_default_settings(paper):
+    """Otherwise every user builds it anew; run scripts/build_motion_cost.py."""
+    assert cost.read_table(package_path(cost.SHIPPED), cost.settings_key(paper, MOTION)).key
 
 
 def test_it_is_near_the_planner(paper, table):
@@ -80,6 +86,17 @@ def test_numpy_torch_batches_and_single_transfers_agree(paper, table):
     folded = table(paper, arm.reshape(3, 20), start.reshape(3, 20, 2), end.reshape(3, 20, 2))
     np.testing.assert_array_equal(folded.reshape(-1), length)
     assert table(paper, arm[7], start[7], end[7]) == pytest.approx(length[7], rel=1e-12)
+
+
+def test_its_slope_is_that_of_small_steps(paper, table):
+    """A learner may follow it downhill."""
+    arm, start, end = (torch.as_tensor(array) for array in transfers(paper, 200, 7))
+    end.requires_grad_()
+    table(paper, arm, start, end).sum().backward()
+    step = torch.tensor([1e-5, 0.0], dtype=torch.float64)
+    there = end.detach()
+    change = (table(paper, arm, start, there + step) - table(paper, arm, start, there - step)) / 2e-5
+    torch.testing.assert_close(end.grad[:, 0], change, rtol=1e-4, atol=1e-4)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3))

@@ -1,0 +1,168 @@
+"""The motion figure: the grip's paths from above and from the side, and joints and clearances over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from marl_handover.cell.build import CellModel
+from marl_handover.cell.symmetry import ARM_LETTERS
+from marl_handover.cell.urdf import ARM_JOINTS
+from marl_handover.config import MotionConfig
+from marl_handover.motion.trajectory import TransferMotion
+from marl_handover.report.palette import BLUE, FAINT, GREY, INK, RED, YELLOW, arm_colour
+from marl_handover.report.table import Axes, draw_bases, draw_sectors, frame_table
+from marl_handover.runtime.motions import CARRYING, clearances_mm, grip_mm
+
+Floats = NDArray[np.float64]
+
+JOINT_STYLES: tuple[tuple[str, Any], ...] = ((BLUE, "-"), (RED, "-"), (YELLOW, "-"), (INK, "--"), (GREY, ":"))
+"""Colour and line of each joint: told apart without colours too."""
+
+SHOWN_MM = 150.0
+"""Clearances above this are not told apart."""
+
+
+def motion_figure(motions: Sequence[TransferMotion], model: CellModel, settings: MotionConfig) -> Figure:
+    """A figure of transfers that follow each other; ``settings`` are the planner's.
+
+    Carried paths are drawn strong, those of the empty hand thin. Times run on over the transfers.
+    """
+    figure = Figure(figsize=(11.5, 8.2), layout="constrained")
+    grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.35), height_ratios=(1.0, 1.0, 1.0))
+    side = figure.add_subplot(grid[2, 0])
+    above = figure.add_subplot(grid[:2, 0])
+    joints = figure.add_subplot(grid[:2, 1])
+    clearance = figure.add_subplot(grid[2, 1], sharex=joints)
+    _draw_above(above, motions, model)
+    _draw_side(side, motions, model)
+    _draw_joints(joints, motions)
+    _draw_clearance(clearance, motions, model, settings)
+    total = sum(motion.duration_s for motion in motions)
+    path = sum(motion.path_length_mm for motion in motions)
+    count = f"{len(motions)} transfer{'' if len(motions) == 1 else 's'}"
+    figure.suptitle(f"{count}, {total:.1f} s, {path:.0f} mm of carried path", fontsize=11)
+    return figure
+
+
+def _pieces(motion: TransferMotion, model: CellModel) -> list[tuple[bool, Floats]]:
+    """The grip's path (n, 3) in each phase, and whether the block is carried in it."""
+    return [(phase.name in CARRYING, grip_mm(model, motion.arm, phase.joints_rad)) for phase in motion.phases]
+
+
+def _draw_above(axes: Axes, motions: Sequence[TransferMotion], model: CellModel) -> None:
+    draw_sectors(axes, model.cell, strength=0.05, width=0.5)
+    numbers: dict[tuple[int, int], list[str]] = {}
+    for number, motion in enumerate(motions, start=1):
+        _draw_path(axes, motion, model, (0, 1))
+        axes.plot(*motion.from_mm, "o", color=arm_colour(motion.arm), markerfacecolor="none", markersize=7, zorder=8)
+        axes.plot(*motion.to_mm, "o", color=arm_colour(motion.arm), markersize=5, zorder=8)
+        numbers.setdefault((round(float(motion.to_mm[0])), round(float(motion.to_mm[1]))), []).append(str(number))
+    for place, at in numbers.items():
+        axes.annotate(", ".join(at), place, xytext=(6, 6), textcoords="offset points", fontsize=9, zorder=9)
+    draw_bases(axes, model.cell, size=12)
+    frame_table(axes, model.cell)
+    axes.set_title("the grip's path from above", fontsize=9, pad=20)
+    axes.set_xlabel("x [mm]")
+    axes.set_ylabel("y [mm]")
+    handles = [
+        Line2D([], [], color=INK, linewidth=2.0, label="carrying"),
+        Line2D([], [], color=INK, linewidth=0.8, linestyle="--", label="empty hand"),
+        Line2D([], [], color=INK, marker="o", markerfacecolor="none", linestyle="none", label="pick"),
+        Line2D([], [], color=INK, marker="o", linestyle="none", label="place"),
+    ]
+    style: dict[str, Any] = {"fontsize": 8, "frameon": False, "columnspacing": 1.0, "handletextpad": 0.4}
+    axes.legend(handles=handles, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), **style)
+
+
+def _draw_side(axes: Axes, motions: Sequence[TransferMotion], model: CellModel) -> None:
+    axes.axhline(0.0, color=INK, linewidth=1.2)
+    height = model.cell.config.pick_height_mm
+    axes.axhline(height, color=GREY, linewidth=0.7, linestyle=":")
+    axes.annotate("pick height", (1.0, height), xycoords=("axes fraction", "data"), xytext=(-3, 3), textcoords="offset points", fontsize=8,
+                  color=GREY, ha="right")  # fmt: skip
+    for motion in motions:
+        _draw_path(axes, motion, model, (1, 2))
+    axes.set_aspect("equal")
+    axes.set_ylim(bottom=-10)
+    axes.set_title("and from the side, along x", fontsize=9)
+    axes.set_xlabel("y [mm]")
+    axes.set_ylabel("z [mm]")
+    _tidy(axes)
+
+
+def _draw_path(axes: Axes, motion: TransferMotion, model: CellModel, plane: tuple[int, int]) -> None:
+    for carrying, path in _pieces(motion, model):
+        style: dict[str, Any] = {"linewidth": 2.0, "zorder": 7} if carrying else {"linewidth": 0.8, "linestyle": "--", "zorder": 6}
+        axes.plot(path[:, plane[0]], path[:, plane[1]], color=arm_colour(motion.arm), **style)
+
+
+def _starts(motions: Sequence[TransferMotion]) -> Floats:
+    """When each transfer begins, (n + 1,), the end of the last included: one follows the other."""
+    return np.concatenate([[0.0], np.cumsum([motion.duration_s for motion in motions])])
+
+
+def _draw_joints(axes: Axes, motions: Sequence[TransferMotion]) -> None:
+    starts = _starts(motions)
+    for motion, begin_s in zip(motions, starts, strict=False):
+        t_s = begin_s + np.concatenate([phase.t_s for phase in motion.phases]) - motion.phases[0].t_s[0]
+        degrees = np.degrees(np.concatenate([phase.joints_rad for phase in motion.phases]))
+        for joint, (colour, line) in enumerate(JOINT_STYLES):
+            axes.plot(t_s, degrees[:, joint], color=colour, linestyle=line, linewidth=1.3)
+    _shade(axes, motions, starts)
+    handles = [
+        Line2D([], [], color=colour, linestyle=line, label=name.replace("_", " "))
+        for name, (colour, line) in zip(ARM_JOINTS, JOINT_STYLES, strict=True)
+    ]
+    axes.legend(handles=handles, fontsize=8, ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.03), frameon=False, columnspacing=1.2)
+    axes.set_ylabel("joint of the moving arm [deg]")
+    _tidy(axes)
+
+
+def _draw_clearance(axes: Axes, motions: Sequence[TransferMotion], model: CellModel, settings: MotionConfig) -> None:
+    starts = _starts(motions)
+    for motion, begin_s in zip(motions, starts, strict=False):
+        t_s = begin_s + np.concatenate([phase.t_s for phase in motion.phases]) - motion.phases[0].t_s[0]
+        to_arm, to_table = clearances_mm(model, settings, motion)
+        axes.plot(t_s, np.minimum(to_arm, SHOWN_MM), color=BLUE, linewidth=1.3)
+        axes.plot(t_s, np.minimum(to_table, SHOWN_MM), color=RED, linewidth=1.3, linestyle="--")
+    for demanded, colour in ((settings.arm_clearance_mm, BLUE), (settings.ground_clearance_mm, RED)):
+        axes.axhline(demanded, color=colour, linewidth=0.7, linestyle=":")
+    _shade(axes, motions, starts, labels=False)
+    handles = [
+        Line2D([], [], color=BLUE, label="to the other arm, block included"),
+        Line2D([], [], color=RED, linestyle="--", label="arm to the table"),
+        Line2D([], [], color=GREY, linestyle=":", label="demanded"),
+    ]
+    axes.legend(handles=handles, fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, columnspacing=1.2)
+    axes.set_ylim(0.0, SHOWN_MM * 1.03)
+    axes.set_ylabel(f"clearance, up to {SHOWN_MM:.0f} [mm]")
+    axes.set_xlabel("t [s]")
+    _tidy(axes)
+
+
+def _shade(axes: Axes, motions: Sequence[TransferMotion], starts: Floats, labels: bool = True) -> None:
+    """A band where the block is carried, in the arm's colour, and a line between transfers."""
+    for number, (motion, begin_s) in enumerate(zip(motions, starts, strict=False), start=1):
+        carried = [phase for phase in motion.phases if phase.name in CARRYING]
+        zero = motion.phases[0].t_s[0]
+        axes.axvspan(begin_s + carried[0].t_s[0] - zero, begin_s + carried[-1].t_s[-1] - zero, color=arm_colour(motion.arm), alpha=0.08)
+        axes.axvline(begin_s + motion.duration_s, color=FAINT, linewidth=0.8)
+        if labels:
+            axes.annotate(
+                f"{number}: {ARM_LETTERS[motion.arm]}", (begin_s + motion.duration_s / 2, 1.0), xycoords=("data", "axes fraction"),
+                xytext=(0, 2), textcoords="offset points", fontsize=8, ha="center", color=arm_colour(motion.arm),
+            )  # fmt: skip
+    axes.set_xlim(0.0, starts[-1])
+
+
+def _tidy(axes: Axes) -> None:
+    axes.grid(axis="y", color=FAINT, linewidth=0.5)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)

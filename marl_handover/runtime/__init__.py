@@ -1,0 +1,1 @@
+"""The closed loop: see, decide, plan, move, see again, on any backend."""

@@ -1,0 +1,128 @@
+"""What is kept of an episode of the closed loop: every transfer, with what it was judged to be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover.envs.cycle_check import FAILURES
+from marl_handover.task.rules import Outcome
+
+Floats = NDArray[np.float64]
+
+SAME_MM, SAME_RAD = 0.01, 1e-4
+"""Poses nearer than this are the same: nothing was moved."""
+
+
+class Done(NamedTuple):
+    """What came of an order to an arm.
+
+    ``pose`` (3,) measured afterwards; ``refusal``: a value of :class:`~marl_handover.envs.cycle_check.Refusal`, or None; ``detail``: the
+    arm's words about it; ``planning_ms``; ``duration_s`` and ``path_mm`` of the motion, 0 if there was none.
+    """
+
+    pose: Floats
+    refusal: str | None
+    detail: str = ""
+    planning_ms: float = 0.0
+    duration_s: float = 0.0
+    path_mm: float = 0.0
+
+    @property
+    def tried(self) -> bool:
+        """Whether the transfer took place, well or badly; else it was refused."""
+        return self.refusal is None or self.refusal in FAILURES
+
+
+class Order(NamedTuple):
+    """What an arm is told.
+
+    Attributes:
+        arm: index.
+        final: whether it is to end the episode.
+        chart: (2,) alpha and beta; 0 for the external final transfer of architecture A.
+        place_mm: (2,) where the object is to go.
+        predicted: (3,) where the rule book says that exact arms leave it.
+        feasible: whether the rule book lets the arm do it.
+    """
+
+    arm: int
+    final: bool
+    chart: Floats
+    place_mm: Floats
+    predicted: Floats
+    feasible: bool
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """One transfer of the loop.
+
+    Attributes:
+        attempt: 0 up to the first verdict; every later verdict counts one on.
+        order: what the arm was told.
+        before: (3,) measured pose.
+        previous_arm: index, -1 for none.
+        done: what came of it.
+        reward: r_A or r_B.
+        terminated, truncated: whether its attempt ends here, by verdict or for want of transfers.
+        outcome: NONE while the attempt goes on.
+    """
+
+    attempt: int
+    order: Order
+    before: Floats
+    previous_arm: int
+    done: Done
+    reward: float
+    terminated: bool
+    truncated: bool
+    outcome: Outcome
+
+    @property
+    def over(self) -> bool:
+        """Whether its attempt ends here."""
+        return self.terminated or self.truncated
+
+    def repeats(self, other: Transfer) -> bool:
+        """Whether both are the same order about an object that has not moved, refused both times."""
+        mine, its = self.order, other.order
+        if self.done.tried or other.done.tried or (mine.arm, mine.final) != (its.arm, its.final):
+            return False
+        moved = abs(self.before - other.before)
+        return bool(moved[:2].max() < SAME_MM and moved[2] < SAME_RAD and abs(mine.place_mm - its.place_mm).max() < SAME_MM)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A whole episode.
+
+    Attributes:
+        goal: (3,).
+        transfers: in order.
+        ended: ``success``, ``transfers`` (none left) or ``stuck``.
+        wall_s: wall-clock time it took.
+    """
+
+    goal: Floats
+    transfers: tuple[Transfer, ...]
+    ended: str
+    wall_s: float
+
+    @property
+    def first(self) -> tuple[Transfer, ...]:
+        """The transfers up to the first verdict."""
+        return tuple(transfer for transfer in self.transfers if transfer.attempt == 0)
+
+    @property
+    def outcome(self) -> Outcome:
+        """The first verdict."""
+        return self.first[-1].outcome
+
+    @property
+    def solved(self) -> bool:
+        """Whether the object came to lie at the goal in the end."""
+        return self.ended == "success"

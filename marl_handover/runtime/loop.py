@@ -1,0 +1,222 @@
+"""The closed loop: see (object, goal) -> decide (policy) -> plan (arm) -> move (backend) -> see again; method sections 3 and 7.
+
+Everything is judged by the one rule book, from what is measured. A missed grasp or a displaced object only changes the next observation.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover.cell import NO_ARM, build_cell
+from marl_handover.config import LoopConfig, MotionConfig
+from marl_handover.envs.backends import Backend, make_backend
+from marl_handover.envs.cycle_check import Refusal
+from marl_handover.errors import HandoverError
+from marl_handover.motion.executor import ROLL_RAD
+from marl_handover.motion.planner import MotionPlanner, OutOfArmsReach
+from marl_handover.motion.trajectory import TransferMotion
+from marl_handover.policies import SupervisorPolicy
+from marl_handover.runtime.episode import Done, Episode, Order, Transfer
+from marl_handover.runtime.reach import drawn_in
+from marl_handover.task.rules import Outcome, Rules, Verdict
+
+Floats = NDArray[np.float64]
+Observer = Callable[[Transfer], None]
+
+REFUSED = Verdict(np.float64(-1.0), np.bool_(True), np.int64(Outcome.WRONG_POSITION))
+"""Architecture A's verdict on a transfer that an arm refused."""
+
+
+@dataclass
+class _Run:
+    """An episode while it goes on."""
+
+    goal: Floats
+    pose: Floats
+    previous: int = NO_ARM
+    attempt: int = 0
+    ended: str | None = None
+    transfers: list[Transfer] = field(default_factory=list)
+
+
+class ClosedLoop:
+    """A supervisor, the arms' planner and a backend at work together.
+
+    The *first verdict* is the rule book's, at the first final placement (architecture B) or the first external finish (A), at
+    ``max_steps`` transfers at the latest. A transfer that the arm or the backend refuses is a wrong position. After any other verdict than
+    success the loop tries again, with the object where it lies, until the object is at the goal or ``settings.transfers`` are spent. It is
+    *stuck* if the object has tipped over, or if an order is refused and then given again about an object that has not moved.
+
+    Args:
+        policy: the supervisor, under the rules that judge it.
+        planner: of the arms' motions.
+        backend: what carries them out.
+        settings: limits of the loop.
+    """
+
+    def __init__(self, policy: SupervisorPolicy, planner: MotionPlanner, backend: Backend, settings: LoopConfig | None = None) -> None:
+        self.policy, self.planner, self.backend, self.settings = policy, planner, backend, settings or LoopConfig()
+        self.settings.validate()
+        self.rules: Rules = policy.rules
+        self.limit = max(self.settings.transfers, self.rules.config.max_steps)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.backend.close()
+
+    def play(self, start: Floats, goal: Floats, seed: int = 0, observer: Observer | None = None) -> Episode:
+        """One problem, start and goal (3,) in mm and rad, to its end; ``observer`` is shown every transfer once it is judged."""
+        begun = time.perf_counter()
+        run = _Run(np.asarray(goal, float), self.backend.reset(np.asarray(start, float), seed))
+        while run.ended is None:
+            first = len(run.transfers)
+            self._decide(run)
+            self._conclude(run)
+            if observer is not None:
+                for transfer in run.transfers[first:]:
+                    observer(transfer)
+        return Episode(run.goal, tuple(run.transfers), run.ended, time.perf_counter() - begun)
+
+    def _decide(self, run: _Run) -> None:
+        """One decision: the policy's order and, in architecture A, the final transfer of an object that can be finished."""
+        if self._finish(run):
+            return
+        self._order(run)
+        if run.transfers[-1].terminated or len(run.transfers) >= self._room(run):
+            return
+        if self._finish(run):  # the reward stands with the order
+            order, external = run.transfers[-2:]
+            run.transfers[-2:] = replace(order, reward=order.reward + 1 + external.reward), replace(external, reward=0.0)
+
+    def _order(self, run: _Run) -> None:
+        """Ask the policy and have its order carried out."""
+        rules, seen = self.rules, self._seen(run)
+        command = rules.decode(self.policy.act(seen, run.goal, np.asarray(run.previous)))
+        predicted, feasible = rules.transfer(seen, run.goal, command)
+        target = run.goal[:2] if command.final else command.place_mm
+        chart = np.array(rules.cell.chart.from_table(command.place_mm), float)
+        order = Order(int(command.arm), bool(command.final), chart, target, predicted, bool(feasible))
+        done = self._move(run.pose, order, seen)
+        if rules.external_finish:
+            # An order that the rule book forbids costs a transfer, as on exact arms; an arm that refuses ends the attempt.
+            verdict = REFUSED if feasible and _lost(done) else rules.external_verdict(done.pose, run.goal, np.int64(NO_ARM))
+        else:
+            verdict = rules.judge(done.pose, run.goal, command.final, np.bool_(not _lost(done)))
+        penalty = rules.motion_penalty(command.arm, run.pose, done.pose)
+        self._record(run, order, done, verdict._replace(reward=verdict.reward - penalty))
+
+    def _finish(self, run: _Run) -> bool:
+        """Architecture A's final transfer, if an arm can do it; whether it was ordered."""
+        if not self.rules.external_finish:
+            return False
+        seen = self._seen(run)
+        external = self.rules.external(seen, run.goal)
+        if external.arm < 0:
+            return False
+        order = Order(int(external.arm), True, np.zeros(2), run.goal[:2], external.pose, True)
+        done = self._move(run.pose, order, seen)
+        self._record(run, order, done, REFUSED if _lost(done) else self.rules.external_verdict(done.pose, run.goal, external.arm))
+        return True
+
+    def _seen(self, run: _Run) -> Floats:
+        return drawn_in(self.rules.cell, run.pose, self.settings.edge_mm)
+
+    @staticmethod
+    def _record(run: _Run, order: Order, done: Done, verdict: Verdict) -> None:
+        reward, terminated, outcome = float(verdict.reward), bool(verdict.terminated), Outcome(int(verdict.outcome))
+        run.transfers.append(Transfer(run.attempt, order, run.pose, run.previous, done, reward, terminated, False, outcome))
+        run.pose = done.pose
+        if done.tried:
+            run.previous = order.arm
+
+    def _move(self, pose: Floats, order: Order, seen: Floats) -> Done:
+        """Plan and carry out a transfer of the object measured at ``pose``, which the supervisor has ``seen``."""
+        if not order.feasible:
+            return Done(pose, Refusal.OUT_OF_REACH)
+        try:
+            motion = self._plan(order, pose, seen)
+        except HandoverError as failure:
+            reason = Refusal.OUT_OF_REACH if isinstance(failure, OutOfArmsReach) else Refusal.DECLINED
+            return Done(pose, reason, str(failure))
+        execution = self.backend.execute(order.arm, motion.paths)
+        return Done(execution.pose, execution.refusal, "", motion.planning_ms, motion.duration_s, execution.path_mm)
+
+    def _plan(self, order: Order, pose: Floats, seen: Floats) -> TransferMotion:
+        joints = self.backend.joints_rad()
+        joints[abs(joints[:, 4]) <= ROLL_RAD, 4] = 0.0
+        own, other = joints[order.arm], np.delete(joints, order.arm, axis=0)[0]
+        try:
+            return self.planner.cycle(order.arm, pose[:2], order.place_mm, own, other)
+        except OutOfArmsReach:
+            if np.array_equal(seen, pose):
+                raise
+            return self.planner.cycle(order.arm, seen[:2], order.place_mm, own, other)
+
+    def _room(self, run: _Run) -> int:
+        """Transfers by which the present attempt has to end."""
+        return self.rules.config.max_steps if run.attempt == 0 else self.limit
+
+    def _conclude(self, run: _Run) -> None:
+        """End the attempt, or the episode, if that is due after a decision."""
+        last, count = run.transfers[-1], len(run.transfers)
+        there = self._at_goal(run) and last.done.refusal != Refusal.TIPPED
+        if run.attempt > 0 and there:
+            last = replace(last, terminated=True, outcome=Outcome.SUCCESS)
+        elif not last.terminated and count >= self._room(run):
+            last = replace(last, truncated=True, outcome=Outcome.TIMEOUT)
+        run.transfers[-1] = last
+        if there and last.over:
+            run.ended = "success"
+        elif last.done.refusal == Refusal.TIPPED or (run.attempt > 0 and last.repeats(run.transfers[-2])):
+            run.ended = "stuck"
+        elif count >= self.limit:
+            run.ended = "transfers"
+        elif last.over:
+            run.attempt += 1
+
+    def _at_goal(self, run: _Run) -> bool:
+        """Whether the object lies at the goal, whoever put it there."""
+        verdict = self.rules.external_verdict(run.pose, run.goal, np.int64(run.transfers[-1].order.arm))
+        return int(verdict.outcome) == Outcome.SUCCESS
+
+
+def _lost(done: Done) -> bool:
+    """Whether nothing can come of the transfer: it was refused, or the object has tipped over."""
+    return not done.tried or done.refusal == Refusal.TIPPED
+
+
+def make_loop(
+    policy: SupervisorPolicy, backend: str, motion: MotionConfig | None = None, settings: LoopConfig | None = None, **options: Any
+) -> ClosedLoop:
+    """A closed loop around a policy, in the policy's own cell.
+
+    On arms that are not exact, placements are judged with their tolerance, and the hand-overs keep away from the edge of the shared space:
+    ``settings.chart_inset``.
+
+    Args:
+        policy: the supervisor.
+        backend: its name, as for :func:`~marl_handover.envs.backends.make_backend`.
+        motion: how the arms move.
+        settings: limits of the loop.
+        options: for the backend.
+
+    Raises:
+        UnknownChoice, InvalidSetting: for a name or a setting that cannot be.
+    """
+    motion, settings = motion or MotionConfig(), settings or LoopConfig()
+    settings.validate()
+    model = build_cell(policy.rules.cell.config)
+    planner = MotionPlanner(model, motion)
+    made = make_backend(backend, model, policy.rules.config, motion, **options)
+    cell = model.cell if made.exact else model.cell.with_inset(min(settings.chart_inset, model.cell.config.chart_inset))
+    rules = Rules(cell, policy.rules.config, policy.rules.motion_cost, physical=not made.exact)
+    return ClosedLoop(policy.under(rules), planner, made, settings)
