@@ -13,6 +13,7 @@ from marl_handover.errors import InvalidSetting, UnknownChoice
 
 ARCHITECTURES = ("A", "B")
 LAYOUTS = ("raw", "relative", "object")
+MOTION_METHODS = ("optimised", "paper")
 HINDSIGHT = ("none", "final", "future", "episode")
 
 
@@ -112,6 +113,7 @@ class MotionConfig:
     lift_mm: float = 40.0  # how high the block travels above the pick height, far from both ends
     lift_scale_mm: float = 25.0  # how fast, in horizontal distance from an end, that height is asked for; shorter ways: all in scale
     approach_scale_mm: float = 10.0  # the same for an empty hand that comes to the pin or leaves it
+    method: str = "optimised"  # of the loaded hand's path: optimised, or paper: its literal formulation with SLSQP, for comparison
     control_points: int = 11  # of each path's spline
     degree: int = 5
     starts: int = 16  # first guesses tried at most

@@ -50,8 +50,9 @@ class Refusal(StrEnum):
     TIPPED = "tipped"
 
 
-FAILURES = frozenset({Refusal.MISSED_GRASP, Refusal.DROPPED, Refusal.TIPPED})
-"""What went wrong with a transfer that was tried. All other reasons: it was refused, the object was not touched or had better not been."""
+FAILURES = frozenset({Refusal.MISSED_GRASP, Refusal.DROPPED})
+"""What went wrong with a transfer that was tried and left an object that can be handled, to be judged by where it lies. All other reasons:
+it was refused, the object was not touched or had better not been; one that has tipped over cannot be gripped."""
 
 
 class CycleCheck:

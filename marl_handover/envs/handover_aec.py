@@ -35,6 +35,10 @@ Observation = dict[str, Any]
 RENDER_MODES = ("rgb_array", "human")
 
 
+TIPPED_OVER = Verdict(np.float64(-1.0), np.bool_(True), np.int64(Outcome.WRONG_POSITION))
+"""Architecture A's verdict on an object that no arm can grip any more; architecture B's is that of an infeasible command."""
+
+
 class Turn(NamedTuple):
     """What an arm is asked to do: take the object to ``target_mm`` (2,); ``planned`` (3,) is where the rule book says it is then."""
 
@@ -237,11 +241,12 @@ class HandoverEnv(AECEnv):
         feasible = np.bool_(refusal is None or refusal in FAILURES)
         self._penalty = float(rules.motion_penalty(command.arm, self._pose, placed))
         self._moved(placed, command.arm if feasible else self._previous)
-        external = self._external() if rules.external_finish and self._transfers < rules.config.max_steps else None
+        tipped = refusal == Refusal.TIPPED
+        external = self._external() if rules.external_finish and not tipped and self._transfers < rules.config.max_steps else None
         if external is not None:
             self._ask(external)
         elif rules.external_finish:
-            self._conclude(rules.external_verdict(placed, self._goal, np.int64(-1)), refusal)
+            self._conclude(TIPPED_OVER if tipped else rules.external_verdict(placed, self._goal, np.int64(-1)), refusal)
         else:
             self._conclude(rules.judge(placed, self._goal, command.final, feasible), refusal)
 
@@ -253,7 +258,8 @@ class HandoverEnv(AECEnv):
     def _finish(self, turn: Turn, placed: Floats, refusal: str | None) -> None:
         """Judge architecture A's final transfer."""
         self._moved(placed, np.int64(turn.arm))
-        self._conclude(self.rules.external_verdict(placed, self._goal, self._previous), refusal)
+        verdict = self.rules.external_verdict(placed, self._goal, self._previous)
+        self._conclude(TIPPED_OVER if refusal == Refusal.TIPPED else verdict, refusal)
 
     def _moved(self, pose: Floats, previous: Any) -> None:
         self._pose, self._previous = pose, np.int64(previous)

@@ -49,9 +49,10 @@ class HybridSacLoss(LossModule):
         start = math.log(config.initial_temperature)
         self.log_temperatures = nn.Parameter(torch.tensor([start, start]))  # of places, of branches
 
-    def afterstates(self, batch: dict[str, Tensor], place: Tensor) -> Tensor:
-        """What follows if each arm placed at ``place`` (n, arms, m, 2): blocks (n, arms, m, 2, fields), the acting arm's first.
+    def afterstates(self, batch: dict[str, Tensor], place: Tensor) -> tuple[Tensor, Tensor]:
+        """What follows if each arm placed at ``place`` (n, arms, m, 2), and what the way there costs.
 
+        Blocks (n, arms, m, 2, fields), the acting arm's first, and (n, arms, m): an afterstate does not know where it was come from.
         ``batch`` gives ``pose``, ``goal``, ``previous_arm`` and ``epsilon``.
         """
         arms = self.rules.cell.num_arms
@@ -64,14 +65,15 @@ class HybridSacLoss(LossModule):
         before, epsilon = (batch[key][:, None, None].expand(shape) for key in ("previous_arm", "epsilon"))
         placed, feasible = self.rules.transfer(pose, goal, command)
         blocks = arm_blocks(observe(self.rules, "relative", placed, goal, torch.where(feasible, arm, before), epsilon))
-        return torch.stack([blocks[:, index].roll(-index, -2) for index in range(arms)], 1)
+        penalty = self.config.reward_scale * self.rules.motion_penalty(arm, pose, placed)
+        return torch.stack([blocks[:, index].roll(-index, -2) for index in range(arms)], 1), penalty
 
     def soft_value(self, critic: AfterstateCritic, batch: dict[str, Tensor], noise: Tensor) -> SoftValue:
         """Soft value of the present policy under ``critic``, from ``pose``, ``goal``, ``epsilon`` and ``observation``."""
         branches = self.actor(batch["observation"])
         place, place_log_prob = squashed_sample(branches, noise)
-        following = self.afterstates(batch, place)
-        place_value = critic.value_place(following).amin(0)
+        following, penalty = self.afterstates(batch, place)
+        place_value = critic.value_place(following).amin(0) - penalty
         final_value = critic.value_final(arm_blocks(batch["observation"])).amin(0)
         temperature = self.log_temperatures.detach().exp()
         log_probability = branches.logits.flatten(1).log_softmax(-1).view_as(branches.logits)
@@ -94,7 +96,8 @@ class HybridSacLoss(LossModule):
         second = batch["arm"][:, None, None] == 1
         own = torch.where(second, blocks.flip(-2), blocks)[:, 0]
         after = torch.where(second, after.flip(-2), after)
-        value = torch.where(batch["final"], self.critic.value_final(own), self.critic.value_place(after))
+        penalty = self.config.reward_scale * self.rules.motion_penalty(batch["arm"], batch["pose"], following["pose"])
+        value = torch.where(batch["final"], self.critic.value_final(own), self.critic.value_place(after) - penalty)
         return (value - target).square().mean(1).sum()
 
     def actor_loss(self, batch: dict[str, Tensor], noise: Tensor, candidates: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -129,7 +132,8 @@ class HybridSacLoss(LossModule):
 
     def _place_value(self, batch: dict[str, Tensor], places: Tensor) -> Tensor:
         """The lower of both critics' values (n, arms, m) of places (n, arms, m, 2)."""
-        return self.critic.value_place(self.afterstates(batch, places)).amin(0)
+        following, penalty = self.afterstates(batch, places)
+        return self.critic.value_place(following).amin(0) - penalty
 
     def temperature_loss(self, branch_entropy: Tensor, place_entropy: Tensor, targets: tuple[float, float]) -> Tensor:
         """Raises a temperature whose entropy (of places, of branches) is below its target."""

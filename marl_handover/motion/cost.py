@@ -232,7 +232,7 @@ def _excess_mm(planner: Any, pick_mm: Floats, place_mm: Floats) -> float:
     motion = planner.motion
     segment, guesses = planner.carrying(0, pick_mm, place_mm, planner.parked_rad)
     try:
-        found = find_path(segment, guesses, motion.control_points, motion.degree, motion.starts, wanted=motion.starts)
+        found = find_path(segment, guesses, motion.control_points, motion.degree, motion.starts, thorough=True)
     except NoPath:
         return math.nan
     return found.length_mm - segment.lower_bound_mm

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from marl_handover.cell import CellModel, build_cell, cell_config
 from marl_handover.cell.spaces import points_in_base
 from marl_handover.config import CellConfig, MotionConfig, require_choice
-from marl_handover.errors import HandoverError
+from marl_handover.errors import HandoverError, InvalidSetting
 from marl_handover.motion.trajectory import CyclePaths, NoPath, OutOfArmsReach
 
 if TYPE_CHECKING:
@@ -54,6 +54,8 @@ class ExecutorAgent:
         require_choice("agent", agent, ARM_AGENTS)
         require_choice("method", method, METHODS)
         self.agent, self.method, self.motion = agent, method, motion or MotionConfig()
+        if self.motion.method != "optimised":  # its splines have another number of control points than the action space
+            raise InvalidSetting("motion.method", self.motion.method, "optimised for an agent of the AEC environment")
         self.arm = ARM_AGENTS.index(agent)
         self.model = cell if isinstance(cell, CellModel) else build_cell(cell_config(cell) if isinstance(cell, str) else cell)
         self.last_refusal: str | None = None

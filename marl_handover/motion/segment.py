@@ -103,7 +103,13 @@ class Segment:
 
 
 def find_path(
-    segment: Segment, guesses: Iterable[Floats], control_points: int, degree: int, starts: int, wanted: int = WANTED
+    segment: Segment,
+    guesses: Iterable[Floats],
+    control_points: int,
+    degree: int,
+    starts: int,
+    wanted: int = WANTED,
+    thorough: bool = False,
 ) -> FoundPath:
     """The shortest of a few feasible paths; of the first one that is near its expected length.
 
@@ -114,6 +120,7 @@ def find_path(
         degree: of the spline.
         starts: guesses and random bends of them, at most.
         wanted: feasible paths to choose from.
+        thorough: choose from all starts.
 
     Raises:
         NoPath: with the reason.
@@ -132,7 +139,7 @@ def find_path(
         else:
             feasible += 1
             best = found if best is None or found.length_mm < best.length_mm else best
-        if best is None:
+        if best is None or thorough:
             continue
         ratio = best.length_mm / max(segment.expected_mm, 1e-9)
         if ratio <= GOOD_RATIO or feasible >= wanted + (wanted > 1 and ratio > FAIR_RATIO) or evaluations > PATIENCE:

@@ -108,9 +108,9 @@ class ClosedLoop:
         done = self._move(run.pose, order, seen)
         if rules.external_finish:
             # An order that the rule book forbids costs a transfer, as on exact arms; an arm that refuses ends the attempt.
-            verdict = REFUSED if feasible and _lost(done) else rules.external_verdict(done.pose, run.goal, np.int64(NO_ARM))
+            verdict = REFUSED if feasible and not done.tried else rules.external_verdict(done.pose, run.goal, np.int64(NO_ARM))
         else:
-            verdict = rules.judge(done.pose, run.goal, command.final, np.bool_(not _lost(done)))
+            verdict = rules.judge(done.pose, run.goal, command.final, np.bool_(done.tried))
         penalty = rules.motion_penalty(command.arm, run.pose, done.pose)
         self._record(run, order, done, verdict._replace(reward=verdict.reward - penalty))
 
@@ -124,7 +124,7 @@ class ClosedLoop:
             return False
         order = Order(int(external.arm), True, np.zeros(2), run.goal[:2], external.pose, True)
         done = self._move(run.pose, order, seen)
-        self._record(run, order, done, REFUSED if _lost(done) else self.rules.external_verdict(done.pose, run.goal, external.arm))
+        self._record(run, order, done, REFUSED if (not done.tried) else self.rules.external_verdict(done.pose, run.goal, external.arm))
         return True
 
     def _seen(self, run: _Run) -> Floats:
@@ -189,11 +189,6 @@ class ClosedLoop:
         return int(verdict.outcome) == Outcome.SUCCESS
 
 
-def _lost(done: Done) -> bool:
-    """Whether nothing can come of the transfer: it was refused, or the object has tipped over."""
-    return not done.tried or done.refusal == Refusal.TIPPED
-
-
 def make_loop(
     policy: SupervisorPolicy, backend: str, motion: MotionConfig | None = None, settings: LoopConfig | None = None, **options: Any
 ) -> ClosedLoop:
@@ -216,6 +211,7 @@ def make_loop(
     settings.validate()
     model = build_cell(policy.rules.cell.config)
     planner = MotionPlanner(model, motion)
+    planner.warm_up()
     made = make_backend(backend, model, policy.rules.config, motion, **options)
     cell = model.cell if made.exact else model.cell.with_inset(min(settings.chart_inset, model.cell.config.chart_inset))
     rules = Rules(cell, policy.rules.config, policy.rules.motion_cost, physical=not made.exact)

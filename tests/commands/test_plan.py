@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 import subprocess
 import sys
 
@@ -164,6 +165,9 @@ def test_motions_of_every_transfer(tmp_path, capsys):
         assert all(set(phase) == {"name", "t_s", "joints_rad"} for phase in row["phases"])
         assert all(len(joints) == 5 for phase in row["phases"] for joints in phase["joints_rad"])
     assert out.count("motion ") == len(transfers) == 4
+    sequential, overlapped = map(float, re.search(r"one after another ([\d.]+) s; .* ([\d.]+) s, \d+ % less", out).groups())
+    assert sequential == pytest.approx(sum(row["phases"][-1]["t_s"][-1] for row in transfers), abs=0.01)
+    assert overlapped < sequential
     assert colours(picture) > 50
 
 

@@ -353,7 +353,7 @@ BAD_ANSWERS = {
     "two paths": (lambda e, env: answer(e, env, paths=np.zeros((2, 9, 5))), "wrong_shape"),
     "ragged": (lambda e, env: answer(e, env, paths=[[1.0], [2.0, 3.0]]), "wrong_shape"),
     "words": (lambda e, env: answer(e, env, grasp="yes"), "wrong_shape"),
-    "NaN": (lambda e, env: answer(e, env, paths=np.full((3, 9, 5), math.nan)), "not_finite"),
+    "NaN": (lambda e, env: answer(e, env, paths=np.full((3, MotionConfig().control_points, 5), math.nan)), "not_finite"),
     "one NaN": (lambda e, env: shifted(e, env, 1, 4, math.nan), "not_finite"),
     "beyond all limits": (lambda e, env: shifted(e, env, 1, 4, 1e6), "joint_limits"),
     "does not grasp": (lambda e, env: answer(e, env, grasp=0), "declined"),
@@ -435,6 +435,30 @@ def test_a_missed_grasp_goes_on_and_the_object_is_seen_again(model, executors):
     env = begun(model, "B", EASY, backend="noisy", backend_options=options)
     command(env, executors, 0, final=1)
     assert result(env) == (-30, True, False, {"refusal": "missed_grasp", "transfers": 1, "outcome": "wrong_position"})
+
+
+class Tipping(KinematicBackend):
+    """The object falls over wherever it is put."""
+
+    exact = False
+
+    def execute(self, arm, paths):
+        return super().execute(arm, paths)._replace(refusal=Refusal.TIPPED)
+
+
+@pytest.mark.parametrize("final", [0, 1])
+@architectures
+def test_an_object_that_tipped_over_is_lost(architecture, final, model, executors):
+    """At the goal or not: no arm can grip it any more."""
+    env = begun(model, architecture, EASY, backend=Tipping(model, MotionConfig()))
+    if architecture == "B":
+        command(env, executors, 0, final=final)
+    else:  # solved at its start: whatever the supervisor says, an arm finishes
+        env.step({**MIDDLE, "arm": 0})
+        obey(env, executors)
+    reward, terminated, truncated, info = result(env)
+    assert (reward, terminated, truncated) == (-30 if architecture == "B" else -1, True, False)
+    assert (info["refusal"], info["outcome"]) == ("tipped", "wrong_position")
 
 
 @architectures

@@ -196,7 +196,7 @@ def test_afterstates_are_what_the_rule_book_says_follows(learner, batch):
     """Also for arms that refuse, after which the previous arm stays what it was."""
     present, _ = unpacked(batch)
     place = torch.rand(len(batch), 2, 1, 2) * 2 - 1
-    blocks = learner.loss.afterstates(present, place)
+    blocks, penalty = learner.loss.afterstates(present, place)
     for arm in range(2):
         action = torch.cat([torch.tensor([[-1.0, 2.0 * arm - 1]]).expand(len(batch), 2), place[:, arm, 0]], -1)
         rules = learner.rules
@@ -205,4 +205,6 @@ def test_afterstates_are_what_the_rule_book_says_follows(learner, batch):
         seen = arm_blocks(observe(rules, "relative", result.placed, present["goal"], after, present["epsilon"]))
         commanded = result.transfers > (result.external_arm >= 0)  # architecture A ignores commands of solved problems
         torch.testing.assert_close(blocks[commanded, arm, 0], seen.roll(-arm, -2)[commanded])
+        expected = learner.loss.config.reward_scale * rules.motion_penalty(torch.full((len(batch),), arm), present["pose"], result.placed)
+        torch.testing.assert_close(penalty[commanded, arm, 0], expected[commanded])
     assert not result.feasible.all()

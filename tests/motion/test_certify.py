@@ -8,7 +8,7 @@ import pytest
 from marl_handover.motion.certify import certify
 from marl_handover.motion.splines import evaluate
 from marl_handover.motion.starts import fitted
-from tests.motion.test_planner import place
+from tests.motion.test_motion_planner import place
 
 OTHER = np.array([-0.3, 1.0, -2.2, 1.2, 0.0])
 

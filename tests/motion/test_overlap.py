@@ -7,7 +7,7 @@ import pytest
 
 from marl_handover.cell.collision import capsule_pairs, segment_distance
 from marl_handover.motion.overlap import earliest_start_s, overlapped
-from tests.motion.test_planner import place
+from tests.motion.test_motion_planner import place
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from marl_handover.cell.build import build_cell, cell_config
 from marl_handover.cell.collision import ground_clearance_mm, self_clearance_mm
 from marl_handover.config import MotionConfig
-from marl_handover.errors import InvalidSetting, NotFinite
+from marl_handover.errors import InvalidSetting, NotFinite, UnknownChoice
+from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.motion.planner import MotionPlanner, OutOfArmsReach, string_length
 from marl_handover.motion.segment import NoPath
 from marl_handover.motion.splines import evaluate
@@ -125,6 +126,17 @@ def test_putting_it_back_where_it_is_goes_nowhere(model, planner):
     assert motion.path_length_mm < 1.0
 
 
+def test_the_papers_method_plans_a_cycle_too(model):
+    planner = MotionPlanner(model, MotionConfig(method="paper"))
+    pick, put = place(model, 0, 180, 0.4), place(model, 0, 190, -0.3)
+    motion = planner.cycle(0, pick, put, planner.parked_rad, planner.parked_rad)
+    assert len(motion.paths.transfer) == 7
+    best = MotionPlanner(model).transfer(0, pick, put, planner.parked_rad)
+    assert motion.path_length_mm == pytest.approx(best.length_mm, rel=0.05)
+    with pytest.raises(InvalidSetting, match="motion.method"):
+        ExecutorAgent("arm_left", model, motion=MotionConfig(method="paper"))
+
+
 def test_an_approach_comes_down_on_the_pin(model, planner):
     """Beside the pin, at the fingers' inner width and less, the fingertips are above its top."""
     pick = place(model, 0, 160, 0.9)
@@ -167,6 +179,11 @@ def test_bad_commands_are_named(model, planner, changes, error, text):
 def test_bad_settings_are_named(model, setting, value):
     with pytest.raises(InvalidSetting, match=f"motion.{setting}"):
         MotionPlanner(model, MotionConfig(**{setting: value}))
+
+
+def test_an_unknown_method_is_named(model):
+    with pytest.raises(UnknownChoice, match="motion.method = 'ompl' is not known; choose one of: optimised, paper"):
+        MotionPlanner(model, MotionConfig(method="ompl"))
 
 
 def test_the_other_shipped_cell_moves_too():
