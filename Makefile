@@ -16,7 +16,7 @@ help:
 	@echo "make demo       install, train a supervisor, evaluate it against the exact planner, leave pictures in runs/"
 	@echo "make test       install and run the tests; make test-slow the slow ones (wheel, SIGKILL, longer learners)"
 	@echo "make check      style, types and import layers; make format repairs the style"
-	@echo "make bench      measure speed, and learning against Stable-Baselines3 (hours)"
+	@echo "make bench      measure motion planning, speed, and learning against Stable-Baselines3 (hours)"
 	@echo "make pretrained train the two policies that are shipped"
 	@echo "make wheel      build a wheel into dist/"
 
@@ -53,7 +53,8 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 bench: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,peers]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,peers,ompl]"
+	$(BIN)/python bench/motion.py
 	$(BIN)/python bench/run.py
 
 # The policies that travel in the wheel; see the origin stored in each file.

@@ -19,6 +19,7 @@ from common import commit, machine, parse, table
 
 from marl_handover.cell import load_cell
 from marl_handover.config import TaskConfig
+from marl_handover.envs import handover_aec
 from marl_handover.envs.goal_env import SupervisorGoalEnv
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.task.planner import ExactPlanner
@@ -71,6 +72,27 @@ def gymnasium_rate(architecture: str, seconds: float, steps: int = 200) -> float
     return rate(loop, steps, seconds)
 
 
+def aec_rate(architecture: str, seconds: float, decisions: int = 100) -> float:
+    """Supervisor decisions a second of the AEC environment, exact kinematics, all agents random, resets and observations included."""
+    env = handover_aec.raw_env(architecture=architecture)
+    env.reset(seed=0)
+    for agent in env.possible_agents:
+        env.action_space(agent).seed(0)
+
+    def loop() -> None:
+        left = decisions
+        while left:
+            if not env.agents:
+                env.reset()
+            agent = env.agent_selection
+            _, _, terminated, truncated, _ = env.last()
+            over = terminated or truncated
+            left -= agent == "supervisor" and not over
+            env.step(None if over else env.action_space(agent).sample())
+
+    return rate(loop, decisions, seconds)
+
+
 def planner_rate(count: int, seconds: float) -> float:
     """Problems a second solved exactly, in one batch."""
     cell = load_cell()
@@ -120,6 +142,7 @@ def measure(values: dict[str, Any]) -> dict[str, Any]:
         "batched_cells": cells,
         "batched_steps_per_s": batched,
         "gymnasium_steps_per_s": loop,
+        "aec_decisions_per_s": {architecture: aec_rate(architecture, seconds) for architecture in ("A", "B")},
         "exact_plans_per_s": planner_rate(values["plans"], seconds),
         "decision": decision_latencies(values["decisions"]),
         "batched_over_gymnasium": batched["1"] / loop["B"],
@@ -138,6 +161,10 @@ def show(found: dict[str, Any]) -> str:
         ],
         ["batched env, 2 threads", f"{batched['2']:,.0f} steps/s", f"{found['two_threads_over_one']:.2f}x 1 thread"],
         *[[f"Gymnasium loop, architecture {name}", f"{value:,.0f} steps/s", ""] for name, value in loop.items()],
+        *[
+            [f"AEC, architecture {name}, random agents", f"{value:,.0f} decisions/s", ""]
+            for name, value in found["aec_decisions_per_s"].items()
+        ],
         ["exact planner, one batch, 1 thread", f"{found['exact_plans_per_s']:,.0f} problems/s", ""],
         *[[f"decision of {name}, p50 / p99", f"{it['p50_ms']:.2f} / {it['p99_ms']:.2f} ms", ""] for name, it in found["decision"].items()],
     ]

@@ -27,8 +27,13 @@ CORE = (
     "matplotlib",
     "tensorboard",
     "tqdm",
+    "numba",
+    "pybullet",
+    "pillow",
+    "imageio",
+    "imageio-ffmpeg",
 )
-EXTRAS = {"peers": ("stable-baselines3",), "dev": ("pytest", "ruff", "mypy", "import-linter")}
+EXTRAS = {"peers": ("stable-baselines3",), "ompl": ("ompl",), "dev": ("pytest", "ruff", "mypy", "import-linter", "toppra")}
 
 
 @dataclass
