@@ -124,6 +124,24 @@ class MotionConfig:
     grasp_s: float = 0.4  # closing the fingers
     release_s: float = 0.3  # opening them
 
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
+        for name in ("arm_clearance_mm", "ground_clearance_mm", "self_clearance_mm", "block_clearance_mm", "lift_mm"):
+            require_at_least(f"motion.{name}", getattr(self, name), 0)
+        for name in ("lift_scale_mm", "approach_scale_mm", "acceleration_deg_s2", "grasp_s", "release_s", "finger_travel_mm"):
+            require_positive(f"motion.{name}", getattr(self, name))
+        require_choice("motion.method", self.method, MOTION_METHODS)
+        require_between("motion.sample_s", self.sample_s, 1e-3, 0.02)
+        require_between("motion.velocity_share", self.velocity_share, 0.01, 1)
+        require_between("motion.degree", self.degree, 3, 7)
+        if self.method == "paper" and self.degree != 5:
+            raise InvalidSetting("motion.degree", self.degree, "5 with motion.method=paper, as the paper has it")
+        require_between("motion.control_points", self.control_points, self.degree + 2, 25)
+        require_at_least("motion.starts", self.starts, 1)
+        angles = self.parked_deg
+        if len(angles) != 5 or not all(math.isfinite(angle) for angle in angles) or angles[4] != 0:
+            raise InvalidSetting("motion.parked_deg", angles, "five finite angles in degrees, the last one, of the wrist roll, 0")
+
 
 @dataclass
 class TaskChanges:
@@ -175,12 +193,14 @@ def require_between(name: str, value: float, low: float, high: float) -> None:
 class LoopConfig:
     """The closed loop on arms that are not exact."""
 
-    transfers: int = 30  # allowed an episode, picking up again after a miss included
+    transfers: int = 30  # allowed an episode, picking up again after a miss included; not fewer than task.max_steps
     chart_inset: float = 0.99  # hand-overs keep to this part of the chart, or to the cell's own part if that is smaller
     edge_mm: float = 1.0  # an object this far outside all reach is taken for one at the edge: the fingers close on its pin all the same
 
-    def validate(self) -> None:
-        """Raise :class:`InvalidSetting` on a value out of its limits."""
+    def validate(self, max_steps: int = 1) -> None:
+        """Raise :class:`InvalidSetting` on a value out of its limits; ``max_steps``: transfers that the task allows up to its verdict."""
         require_at_least("loop.transfers", self.transfers, 1)
+        if self.transfers < max_steps:
+            raise InvalidSetting("loop.transfers", self.transfers, f"at least task.max_steps = {max_steps}")
         require_between("loop.chart_inset", self.chart_inset, 0.1, 1)
-        require_between("loop.edge_mm", self.edge_mm, 0, 5)
+        require_between("loop.edge_mm", self.edge_mm, 0, 1)  # an arm refuses to close its fingers farther than that from the pin

@@ -62,7 +62,7 @@ def arm_body(model: CellModel, motion: MotionConfig) -> ArmBody:
         ends = [T_base_link[:3, :3] @ np.array(end) + T_base_link[:3, 3] for end in (shape.start_mm, shape.end_mm)]
         offset = np.array([pivots[level][0], 0.0, pivots[level][1]])
         rows.append([level, *(ends[0] - offset), *(ends[1] - offset), shape.radius_mm])
-    shaped = _with_half_lengths(rows, 1)
+    shaped = _with_half_lengths([_standing(row) if row[0] == 0 else row for row in rows], 1)
     order = np.argsort([row[0] for row in rows], kind="stable")
     rank = np.argsort(order)
     capsules = shaped[order]
@@ -91,6 +91,12 @@ def arm_body(model: CellModel, motion: MotionConfig) -> ArmBody:
     levers = _levers_mm(planar, held, limits)
     bare_pairs = all_pairs[all_pairs.max(axis=1) < len(capsules)]
     return ArmBody(planar, capsules, bare_pairs, held, all_pairs, edges, limits, float(levers[0]), levers)
+
+
+def _standing(row: list[float]) -> list[float]:
+    """A capsule of the base, which does not turn with the yaw, as one that may: on the yaw axis, around all its places."""
+    wide = max(math.hypot(row[1], row[2]), math.hypot(row[4], row[5]))
+    return [row[0], 0.0, 0.0, row[3], 0.0, 0.0, row[6], row[7] + wide]
 
 
 def block_capsules(block: BlockConfig, grip_to_table_mm: float) -> list[Capsule]:

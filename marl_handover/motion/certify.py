@@ -27,9 +27,11 @@ FIRST = 8
 
 
 class Certificate(NamedTuple):
-    """What is proved of a path: no margin to the other arm, the block, itself or the table is anywhere below ``margin_mm``.
+    """What is proved of a path: its margins to the other arm, the standing block, itself and the table are nowhere below ``margin_mm``.
 
-    ``proved``: it is at least 0, so that every clearance demanded holds everywhere. ``looks``: postures looked at.
+    ``proved``: that is at least 0, so that these clearances hold everywhere. Not part of it are the heights of the grip over the
+    lift-over profile and of the held block over the table: they are met exactly at both ends, where no bound can tell. ``looks``:
+    postures looked at.
     """
 
     margin_mm: float

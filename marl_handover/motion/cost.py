@@ -154,9 +154,10 @@ def cost_table(cell: Cell, motion: MotionConfig) -> CostTable:
 def settings_key(cell: Cell, motion: MotionConfig) -> str:
     """A short name of all that the path lengths depend on: 16 hexadecimal digits.
 
-    The name of a cell and the part of its chart in use do not count, nor what concerns only the timing.
+    The name of a cell and the part of its chart in use do not count, nor what concerns only the timing; and a table holds what the
+    optimiser finds, whatever method plans.
     """
-    untimed = {"velocity_share", "acceleration_deg_s2", "sample_s", "grasp_s", "release_s"}
+    untimed = {"method", "velocity_share", "acceleration_deg_s2", "sample_s", "grasp_s", "release_s"}
     settings = sorted((name, value) for name, value in asdict(motion).items() if name not in untimed)
     shape = to_yaml(replace(cell.config, name="", urdf="", chart_inset=1.0))
     digest = hashlib.sha256(repr((RADII, YAWS, DISTANCES, shape, settings)).encode())

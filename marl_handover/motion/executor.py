@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.cell import CellModel, build_cell, cell_config
-from marl_handover.cell.spaces import points_in_base
 from marl_handover.config import CellConfig, MotionConfig, require_choice
 from marl_handover.errors import HandoverError, InvalidSetting
+from marl_handover.motion.grasp import level_joints
 from marl_handover.motion.trajectory import CyclePaths, NoPath, OutOfArmsReach
 
 if TYPE_CHECKING:
@@ -30,9 +30,6 @@ DECLINED, OUT_OF_REACH, NO_PATH = range(3)
 
 ROLL_RAD = 0.02
 """The planner starts from wrist roll 0; a measured roll up to this is taken for it."""
-
-EDGE_RAD = 1e-4
-"""A pose at the edge of the annulus may need a joint this far past its limit; the joint stays at it, the grip is some 20 um off."""
 
 
 class ExecutorAgent:
@@ -78,7 +75,12 @@ class ExecutorAgent:
         return {"paths": points, "grasp": willing, "release": willing, "reason": np.int64(reason)}
 
     def _direct(self, pick_mm: Floats, place_mm: Floats, joints_rad: Floats) -> CyclePaths:
-        ends = joints_rad, self._level(pick_mm), self._level(place_mm), np.radians(self.motion.parked_deg)
+        ends = (
+            joints_rad,
+            level_joints(self.model, self.arm, "pick up", pick_mm),
+            level_joints(self.model, self.arm, "place", place_mm),
+            np.radians(self.motion.parked_deg),
+        )
         return CyclePaths(*(np.linspace(start, end, self.motion.control_points) for start, end in pairwise(ends)))
 
     def _made_planner(self) -> MotionPlanner:
@@ -92,16 +94,6 @@ class ExecutorAgent:
         joints = joints_rad.copy()
         joints[4] = joints[4] if abs(joints[4]) > ROLL_RAD else 0.0
         return planner.cycle(self.arm, pick_mm, place_mm, joints, others_rad).paths
-
-    def _level(self, position_mm: Floats) -> Floats:
-        """Joints (5,) of the level grip at a place (2,) of the table, at the pick height."""
-        base, arm = self.model.cell.bases[self.arm], self.model.arm
-        x, y = points_in_base(position_mm, (base.x_mm, base.y_mm, base.facing_rad))
-        joints = arm.ik([x, y, self.model.cell.config.pick_height_mm])[0]
-        inside = np.clip(joints, arm.lower_rad, arm.upper_rad)
-        if not (abs(joints - inside) <= EDGE_RAD).all():
-            raise OutOfArmsReach(self.arm, "be level", position_mm)
-        return inside
 
 
 def _code(failure: HandoverError) -> int:

@@ -1,8 +1,8 @@
 """Overlapping transfers: the next arm sets out while the one before still moves, as early as their clearance allows.
 
 The paths stay as they are; only the start of each cycle is moved. On a common clock the two motions keep the demanded clearance at every
-sample. (The delay search of coordination diagrams: O'Donnell and Lozano-Perez, "Deadlock-free and collision-free coordination of two
-robot manipulators", ICRA 1989.)
+time: at a sample more is asked by what both arms can move until half-way to the next. (The delay search of coordination diagrams:
+O'Donnell and Lozano-Perez, "Deadlock-free and collision-free coordination of two robot manipulators", ICRA 1989.)
 """
 
 from __future__ import annotations
@@ -64,8 +64,10 @@ def earliest_start_s(planner: MotionPlanner, before: TransferMotion, motion: Tra
     Until it starts, its arm holds still where its approach begins; after its end, the arm before is parked.
     """
     step = planner.motion.sample_s
-    gaps = pairwise_clearance(*_placed(planner, before, step), *_placed(planner, motion, step))
-    clear = gaps >= planner.motion.arm_clearance_mm
+    first, counts, moved = _placed(planner, before, step)
+    second, others, moving = _placed(planner, motion, step)
+    gaps = pairwise_clearance(first, counts, second, others)
+    clear = gaps >= planner.motion.arm_clearance_mm + (moved[:, None] + moving[None, :]) / 2
     least = math.ceil((_end_of(before.phases, "release") - _end_of(motion.phases, "approach")) / step)
     for delay in range(len(clear) - 1, max(least, 0) - 1, -1):
         if not _free(clear, delay):
@@ -91,8 +93,10 @@ def _free(clear: NDArray[np.bool_], delay: int) -> bool:
     return bool(clear[times, np.clip(times - delay, 0, len(clear[0]) - 1)].all())
 
 
-def _placed(planner: MotionPlanner, motion: TransferMotion, step: float) -> tuple[Floats, NDArray[np.int64]]:
-    """World shapes of an arm along its cycle at even times, and how many of them count: the block's only while it is held."""
+def _placed(planner: MotionPlanner, motion: TransferMotion, step: float) -> tuple[Floats, NDArray[np.int64], Floats]:
+    """World shapes of an arm along its cycle at even times; how many of them count, the block's only while it is held; and a bound in mm
+    on how far any of them moves from each sample to the next or from the one before.
+    """
     phases = motion.phases
     t = np.concatenate([phase.t_s for phase in phases])
     q = np.concatenate([phase.joints_rad for phase in phases])
@@ -104,7 +108,8 @@ def _placed(planner: MotionPlanner, motion: TransferMotion, step: float) -> tupl
     counts = np.where(np.isin(names[at], LOADED), held, bare)
     base = planner.model.cell.bases[motion.arm]
     shapes = world_shapes(joints, planner.body.planar, planner.body.held, base.x_mm, base.y_mm, base.facing_rad)
-    return shapes, counts
+    moves = np.abs(np.diff(joints, axis=0)) @ planner.body.levers_mm
+    return shapes, counts, np.maximum(np.append(moves, 0.0), np.append(0.0, moves))
 
 
 def _end_of(phases: Sequence[Phase], name: str) -> float:

@@ -54,9 +54,10 @@ def plan_paper(segment: Segment, maxiter: int = 100, tolerance_mm: float = 0.0) 
     refuse_bad_ends(segment)
     solution, iterations = solve(segment, maxiter)
     misses = np.abs(_pose_errors(segment, solution))
-    margins, length = segment.check(np.array(sampled_basis(DENSE_SAMPLES, CONTROL_POINTS, DEGREE)) @ solution[:, :4])
     if max(misses[:, :3].max() / END_TOLERANCE_MM, misses[:, 3:].max() / END_TOLERANCE_RAD) > 1.0:
         raise NoPath("path", "the demanded poses at its ends", float(misses[:, :3].max()), 1)
+    solution[[0, -1], :4], solution[[0, -1], 4] = segment.ends, 0.0  # so near, they may as well be exact: other paths join there
+    margins, length = segment.check(np.array(sampled_basis(DENSE_SAMPLES, CONTROL_POINTS, DEGREE)) @ solution[:, :4])
     if not margins.worst >= -tolerance_mm:
         raise NoPath("path", f"what is demanded at {DENSE_SAMPLES} samples", -margins.worst, 1)
     return FoundPath(solution, length, margins, 1, iterations)

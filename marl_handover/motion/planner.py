@@ -15,18 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.cell.build import CellModel
 from marl_handover.cell.spaces import points_in_base
-from marl_handover.config import MOTION_METHODS, MotionConfig, require_at_least, require_between, require_choice, require_positive
+from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed
 from marl_handover.motion.body import arm_body, ball_around, standing_arm, standing_block
+from marl_handover.motion.grasp import level_joints
 from marl_handover.motion.scene import Scene
 from marl_handover.motion.segment import FoundPath, Segment, find_path
 from marl_handover.motion.starts import GRIP_LEAST_MM, SAMPLES, carrying_starts, reaching_starts
-from marl_handover.motion.trajectory import CyclePaths, OutOfArmsReach, TransferMotion
+from marl_handover.motion.trajectory import CyclePaths, TransferMotion
 
 Floats = NDArray[np.float64]
-
-EDGE_RAD = 1e-4
-"""A pose at the very edge may need a joint this far past its limit; the joint stays at the limit, the grip is some 20 um off."""
 
 PAPER_TOLERANCE_MM = 1.0
 """The paper's formulation holds its demands at its samples; in between it may fall short by this much."""
@@ -49,10 +47,10 @@ class MotionPlanner:
 
     def __init__(self, model: CellModel, motion: MotionConfig | None = None) -> None:
         self.model, self.motion = model, motion or MotionConfig()
-        validate(self.motion)
+        self.motion.validate()
         self.parked_rad = np.radians(np.asarray(self.motion.parked_deg, float))
-        if self.parked_rad.shape != (5,) or not model.arm.within_limits(self.parked_rad):
-            raise InvalidSetting("motion.parked_deg", self.motion.parked_deg, "five angles within the joint limits")
+        if not model.arm.within_limits(self.parked_rad):
+            raise InvalidSetting("motion.parked_deg", self.motion.parked_deg, "angles within the joint limits")
         self.body = arm_body(model, self.motion)
         self.clearance_mm = np.array([self.motion.self_clearance_mm, self.motion.ground_clearance_mm])
         self._standing: tuple[tuple[int, bytes], Floats] = ((-1, b""), np.zeros((0, 9)))  # the last one asked for
@@ -155,13 +153,7 @@ class MotionPlanner:
 
     def grasp_joints(self, arm: int, what: str, position_mm: Floats) -> Floats:
         """Joints (5,) that hold the pin at a world position (2,) with pitch = roll = 0. Raises :class:`OutOfArmsReach`."""
-        at = self.in_base(arm, position_mm)
-        q = self.model.arm.ik(np.array([*at, self.pick_height_mm]))
-        inside = np.clip(q, self.model.arm.lower_rad, self.model.arm.upper_rad)
-        good = (np.abs(q - inside) <= EDGE_RAD).all(axis=-1)  # NaN, out of reach, is not
-        if not good.any():
-            raise OutOfArmsReach(arm, what, position_mm)
-        return np.asarray(inside[int(np.argmax(good))])
+        return level_joints(self.model, arm, what, position_mm)
 
     def _scene(self, holding: bool, obstacles: Floats, arm_rows: int, profile: Floats) -> Scene:
         """The arm, empty or with the block, among obstacles."""
@@ -232,17 +224,3 @@ def detour_length(ends_mm: Floats, radius_mm: float) -> float:
 
 def _turns_left(s: Floats, z: Floats, a: int, b: int, c: int) -> bool:
     return bool((s[b] - s[a]) * (z[c] - z[a]) - (z[b] - z[a]) * (s[c] - s[a]) >= 0.0)
-
-
-def validate(motion: MotionConfig) -> None:
-    """Raise :class:`InvalidSetting` on a setting out of its limits."""
-    for name in ("arm_clearance_mm", "ground_clearance_mm", "self_clearance_mm", "block_clearance_mm", "lift_mm"):
-        require_at_least(f"motion.{name}", getattr(motion, name), 0)
-    for name in ("lift_scale_mm", "approach_scale_mm", "acceleration_deg_s2", "grasp_s", "release_s", "finger_travel_mm"):
-        require_positive(f"motion.{name}", getattr(motion, name))
-    require_choice("motion.method", motion.method, MOTION_METHODS)
-    require_between("motion.sample_s", motion.sample_s, 1e-3, 0.02)
-    require_between("motion.velocity_share", motion.velocity_share, 0.01, 1)
-    require_between("motion.degree", motion.degree, 3, 7)
-    require_between("motion.control_points", motion.control_points, motion.degree + 2, 25)
-    require_at_least("motion.starts", motion.starts, 1)

@@ -21,7 +21,7 @@ from marl_handover.motion.verify import ROUNDING_MM, Margins, dense_margins
 Floats = NDArray[np.float64]
 
 DENSE_SAMPLES = 1001
-SAMPLES, CROWDING = 41, 0.6
+DESCENT_SAMPLES, CROWDING = 41, 0.6
 WEIGHTS = np.array([0.1, 0.005])
 """Of even speed and of joint motion, beside the length: enough to leave no direction without curvature."""
 
@@ -115,7 +115,7 @@ def find_path(
 
     Args:
         segment: what is asked.
-        guesses: joint samples of first guesses, each (SAMPLES, 4).
+        guesses: joint samples of first guesses, each (S, 4), S as :mod:`marl_handover.motion.starts` has it.
         control_points: N.
         degree: of the spline.
         starts: guesses and random bends of them, at most.
@@ -204,6 +204,6 @@ def _named(margins: Margins) -> str:
 @lru_cache(maxsize=16)
 def _spline(control_points: int, degree: int) -> Spline:
     """The spline of a path of 1 mm, joint limits left open."""
-    tau = sample_places(SAMPLES, CROWDING)
+    tau = sample_places(DESCENT_SAMPLES, CROWDING)
     B = np.ascontiguousarray(basis(tau, control_points, degree))
     return Spline(B, np.diff(tau), smoothing_metric(control_points, degree), np.empty((4, 2)))

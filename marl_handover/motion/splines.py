@@ -43,18 +43,3 @@ def evaluate(control_points: ArrayLike, tau: ArrayLike, degree: int, derivative:
     """The path of control points (N, joints), or its derivative, at ``tau`` (n,): (n, joints)."""
     points = np.asarray(control_points, dtype=float)
     return basis(tau, len(points), degree, derivative) @ points
-
-
-def hull(control_points: ArrayLike) -> tuple[Floats, Floats]:
-    """Lower and upper bound (joints,) of the whole path: the least and greatest control point of each joint."""
-    points = np.asarray(control_points, dtype=float)
-    return points.min(axis=0), points.max(axis=0)
-
-
-def fit(samples: ArrayLike, control_points: int, degree: int) -> Floats:
-    """Control points (N, joints) of the path nearest, in least squares, to ``samples`` (n, joints) at even tau, ends exact."""
-    values = np.asarray(samples, dtype=float)
-    B = sampled_basis(len(values), control_points, degree)
-    ends = np.outer(B[:, 0], values[0]) + np.outer(B[:, -1], values[-1])
-    inner = np.linalg.lstsq(B[:, 1:-1], values - ends, rcond=None)[0]
-    return np.concatenate([values[:1], inner, values[-1:]])

@@ -17,7 +17,7 @@ from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.motion.cycle import LIFTED_MM, timed_phases
-from marl_handover.motion.splines import fit
+from marl_handover.motion.splines import basis
 from marl_handover.motion.trajectory import PHASES, CyclePaths, Phase
 
 Floats = NDArray[np.float64]
@@ -29,13 +29,20 @@ VELOCITY = MOTION.velocity_share * np.array([ARM.description.joint(name).velocit
 ACCELERATION = math.radians(MOTION.acceleration_deg_s2)
 
 
+def fitted(samples):
+    """Control points near joint samples at even tau, the ends exact."""
+    B = basis(np.linspace(0, 1, len(samples)), MOTION.control_points, MOTION.degree)
+    ends = np.outer(B[:, 0], samples[0]) + np.outer(B[:, -1], samples[-1])
+    return np.concatenate([samples[:1], np.linalg.lstsq(B[:, 1:-1], samples - ends)[0], samples[-1:]])
+
+
 def cycle_paths(yaws_rad: tuple[float, float], radii_mm: tuple[float, float], lift_mm: float = 40.0) -> CyclePaths:
     """A cycle of an arm alone: over the table in an arc, straight in joints to and from the parked pose."""
     part = np.linspace(0.0, 1.0, 60)
     yaw, radius = (low + (high - low) * part for low, high in (yaws_rad, radii_mm))
     height = PICK_MM + lift_mm * np.sin(math.pi * part)
     grip = np.stack([radius * np.cos(yaw), radius * np.sin(yaw), height], axis=1)
-    transfer = fit(ARM.ik(grip)[:, 0], MOTION.control_points, MOTION.degree)
+    transfer = fitted(ARM.ik(grip)[:, 0])
     parked = np.radians(MOTION.parked_deg)
     way = np.linspace(0.0, 1.0, MOTION.control_points)[:, None]
     return CyclePaths(parked + way * (transfer[0] - parked), transfer, transfer[-1] + way * (parked - transfer[-1]))

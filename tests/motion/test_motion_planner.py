@@ -15,10 +15,10 @@ from marl_handover.cell.collision import ground_clearance_mm, self_clearance_mm
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting, NotFinite, UnknownChoice
 from marl_handover.motion.executor import ExecutorAgent
-from marl_handover.motion.planner import MotionPlanner, OutOfArmsReach, string_length
+from marl_handover.motion.planner import MotionPlanner, string_length
 from marl_handover.motion.segment import NoPath
 from marl_handover.motion.splines import evaluate
-from marl_handover.motion.trajectory import PHASES
+from marl_handover.motion.trajectory import PHASES, OutOfArmsReach
 
 
 def place(model, arm, r, yaw):
@@ -179,6 +179,11 @@ def test_bad_commands_are_named(model, planner, changes, error, text):
 def test_bad_settings_are_named(model, setting, value):
     with pytest.raises(InvalidSetting, match=f"motion.{setting}"):
         MotionPlanner(model, MotionConfig(**{setting: value}))
+
+
+def test_the_papers_method_has_its_own_degree(model):
+    with pytest.raises(InvalidSetting, match="motion.degree = 4: must be 5 with motion.method=paper"):
+        MotionPlanner(model, MotionConfig(method="paper", degree=4))
 
 
 def test_an_unknown_method_is_named(model):

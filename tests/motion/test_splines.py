@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.motion.splines import basis, evaluate, fit, hull, knots
+from marl_handover.motion.splines import basis, evaluate, knots
 
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 8)).map(lambda pair: (pair[0] + pair[1], pair[0]))
 
@@ -26,9 +26,8 @@ def test_a_path_starts_and_ends_at_its_control_points_and_stays_in_their_hull(si
     points = np.random.default_rng(seed).normal(size=(size[0], 5))
     path = evaluate(points, np.linspace(0, 1, 101), size[1])
     np.testing.assert_allclose(path[[0, -1]], points[[0, -1]], atol=1e-12)
-    low, high = hull(points)
-    assert (path >= low - 1e-12).all()
-    assert (path <= high + 1e-12).all()
+    assert (path >= points.min(axis=0) - 1e-12).all()
+    assert (path <= points.max(axis=0) + 1e-12).all()
 
 
 @pytest.mark.parametrize("derivative", [1, 2])
@@ -37,12 +36,6 @@ def test_derivatives_agree_with_differences(derivative):
     tau, h = np.linspace(0.01, 0.99, 37), 1e-5
     low, high = (evaluate(points, tau + sign * h, 5, derivative - 1) for sign in (-1, 1))
     np.testing.assert_allclose(evaluate(points, tau, 5, derivative), (high - low) / (2 * h), rtol=1e-5, atol=1e-4)
-
-
-@given(st.integers(0, 1000))
-def test_fitting_gives_a_spline_back(seed):
-    points = np.random.default_rng(seed).normal(size=(9, 4))
-    np.testing.assert_allclose(fit(evaluate(points, np.linspace(0, 1, 50), 5), 9, 5), points, atol=1e-9)
 
 
 @pytest.mark.parametrize(("count", "degree"), [(5, 5), (3, 5), (4, 0)])
