@@ -7,8 +7,9 @@
 In each problem one arm carries the block while the other holds still in a random grasp (60 %) or lifted pose over the table. Half of the
 problems are *blocked*: the plainest guess, lifted and around the base, runs into the other arm. Both ends keep the demanded clearances.
 
-12 of the first 1,000 drawn have the other arm hanging over an end, so that the block cannot be lifted as the lift-over demands: neither the
-long search nor RRT-Connect in 15 s (extra [ompl]) found any way. They are kept in no_way.jsonl: the planner must refuse them by name.
+10 of the first 1,000 drawn were replaced: the other arm hangs over an end, so that the block cannot be lifted as the lift-over demands, and
+neither the long search nor RRT-Connect in 15 s (extra [ompl]) found any way. They are kept in no_way.jsonl: the planner must refuse them
+by name.
 """
 
 from __future__ import annotations

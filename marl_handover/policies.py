@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from marl_handover.arrays import select
 from marl_handover.cell import Cell, load_cell
-from marl_handover.config import CellConfig, NoiseConfig, RewardConfig, TaskConfig
+from marl_handover.config import CellConfig, MotionConfig, NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.errors import CheckpointMismatch, CorruptFile, MissingFile, UnknownChoice
 from marl_handover.motion.cost import motion_cost
 from marl_handover.resources import package_path
@@ -187,7 +187,9 @@ class NetworkPolicy(SupervisorPolicy):
         return np.concatenate(parts, -1)
 
 
-def load(name: str, cell: Cell | None = None, task: TaskConfig | None = None, seed: int = 0) -> SupervisorPolicy:
+def load(
+    name: str, cell: Cell | None = None, task: TaskConfig | None = None, seed: int = 0, *, motion: MotionConfig | None = None
+) -> SupervisorPolicy:
     """A policy by name: ``exact``, ``random``, ``greedy``, ``pretrained_a``, ``pretrained_b``, a run directory or a policy file (``.npz``).
 
     Args:
@@ -195,44 +197,48 @@ def load(name: str, cell: Cell | None = None, task: TaskConfig | None = None, se
         cell: the cell; the trained policy's own, or the shipped ``paper`` cell, if None.
         task: the task; the trained policy's own, or the defaults, if None.
         seed: of ``random``.
+        motion: how the arms move whose ways are priced; the defaults if None.
 
     Raises:
         UnknownChoice, MissingFile, CorruptFile, CheckpointMismatch: if there is no such policy or its file is not whole.
     """
     if name in ("exact", "random", "greedy"):
-        rules = _rules(cell or load_cell(), task or TaskConfig())
+        rules = _rules(cell or load_cell(), task or TaskConfig(), motion)
         made = {"exact": ExactPolicy, "greedy": GreedyPolicy}
         return RandomPolicy(rules, seed) if name == "random" else made[name](rules)
     arrays = _arrays(name)
     about = json.loads(str(arrays["about"]))
     own_cell, own_task = stored_settings(about)
-    return NetworkPolicy(_rules(cell or load_cell(own_cell), task or own_task), name, arrays, about)
+    return NetworkPolicy(_rules(cell or load_cell(own_cell), task or own_task, motion), name, arrays, about)
 
 
-def adapted(name: str, cell: CellConfig | None = None, seed: int = 0, **changes: Any) -> SupervisorPolicy:
+def adapted(
+    name: str, cell: CellConfig | None = None, seed: int = 0, *, motion: MotionConfig | None = None, **changes: Any
+) -> SupervisorPolicy:
     """A policy by name under its own cell and task, except where the caller says otherwise.
 
     Args:
         name: as in :func:`load`.
         cell: settings of another cell.
         seed: of ``random``.
+        motion: as in :func:`load`.
         changes: task settings put over the policy's own; None leaves one as it is.
 
     Raises:
         CheckpointMismatch: ``architecture`` is asked for and the policy was trained for the other one.
     """
-    own = load(name, seed=seed)
+    own = load(name, seed=seed, motion=motion)
     settings = replace(own.rules.config, **{key: value for key, value in changes.items() if value is not None})
     settings.validate()
     trained = own.rules.config.architecture
     if isinstance(own, NetworkPolicy) and settings.architecture != trained:
         raise CheckpointMismatch(name, "architecture", trained, settings.architecture)
-    return own.under(_rules(own.rules.cell if cell is None else load_cell(cell), settings))
+    return own.under(_rules(own.rules.cell if cell is None else load_cell(cell), settings, motion))
 
 
-def _rules(cell: Cell, task: TaskConfig) -> Rules:
+def _rules(cell: Cell, task: TaskConfig, motion: MotionConfig | None) -> Rules:
     """The rule book that training used too."""
-    return Rules(cell, task, motion_cost(cell, task))
+    return Rules(cell, task, motion_cost(cell, task, motion))
 
 
 def stored_settings(about: Mapping[str, Any]) -> tuple[CellConfig, TaskConfig]:

@@ -69,3 +69,36 @@ def test_the_result_table_says_what_the_runs_say(run):
         and f"{summary['wall_s']:.0f}" in row
     ]
     assert len(rows) == 1
+
+
+def words(spread, *forms):
+    """A spread's median, 95th percentile and worst as a row of the table has them."""
+    return " | ".join(form.format(spread[key]) for key, form in zip(("median", "p95", "worst"), forms, strict=True))
+
+
+def test_the_motion_table_says_what_the_bench_says():
+    found = json.loads((RESULTS / "motion.json").read_text())
+    ours, paper, ompl = found["transfers"], found["paper"], found["ompl"]
+    for expected in (
+        "one transfer planned, ms | " + words(ours["ms"], "{:.2f}", "{:.1f}", "{:.0f}"),
+        "path length ÷ best known | " + words(ours["length_over_best"], "{:.4f}", "{:.4f}", "{:.2f}"),
+        "on every 50th, ms | " + words(paper["paper_ms"], "{:.0f}", "{:.0f}", "{:,.0f}"),
+        f"({ompl['ompl_length_over_ours']['median']:.2f} × our length) | " + words(ompl["ompl_ms"], "{:.1f}", "{:.0f}", "{:,.0f}"),
+        f"({found['timing']['duration_over_toppra_500']['median']:.4f} × toppra's duration) | "
+        + words(found["timing"]["ours_ms"], "{:.3f}", "{:.3f}", "{:.3f}"),
+        "seven phases, ms | " + words(found["cycles"]["ms"], "{:.2f}", "{:.1f}", "{:.1f}"),
+        f"program is {paper['times_faster']:.0f} times slower; {paper['paper_found_within_1_mm']} of its 20 paths hold within 1 mm "
+        f"({paper['paper_found_without_tolerance']} without tolerance)",
+        f"saves {100 * found['overlap']['saved']:.1f} % of the time",
+    ):
+        assert expected in TEXT
+    assert (ours["success"], ours["rows"], found["proofs"]["proved"]) == (1, 1000, 1)
+
+
+@pytest.mark.parametrize(("name", "label"), [("exact", "exact planner"), ("pretrained_b", "`pretrained_b`")])
+def test_the_bullet_table_says_what_the_runs_say(name, label):
+    result = json.loads((RESULTS / "bullet" / f"{name}.json").read_text())
+    assert (result["backend"], result["episodes"], result["seed"], result["epsilon_deg"]) == ("bullet", 500, 100, 5.0)
+    first, end = (round(500 * result[key]) for key in ("success_rate", "success_in_the_end"))
+    errors = f"{result['transfer_error_mm']['p95']:.2f} mm, {result['transfer_error_deg']['p95']:.2f}°"
+    assert f"| {label} | {first} of 500 | {end} of 500 | {result['steps_ratio']:.3f} | {errors} |" in TEXT

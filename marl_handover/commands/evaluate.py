@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from marl_handover import policies
+from marl_handover.commands.plan import changed
 from marl_handover.config import CellConfig, LoopConfig, MotionConfig, TaskChanges, require_at_least, require_choice, require_seed
 from marl_handover.errors import InvalidSetting, MissingFile
 from marl_handover.learning.evaluation import Evaluation, decision_time, evaluate, random_problems, read_problems
@@ -65,7 +66,7 @@ def run(config: EvaluateCommand) -> int:
         if path and Path(path).is_dir():
             raise InvalidSetting(name, path, "a file, not a folder")
     options = _backend_options(config)
-    policy = policies.adapted(config.policy, config.cell, config.seed, **vars(config.task))
+    policy = policies.adapted(config.policy, config.cell, config.seed, motion=config.motion, **vars(config.task))
     play = _play_kinematic if config.backend == "kinematic" else _play_loop
     result, trace_text, rules, added = play(config, policy, options)
     report = {
@@ -134,6 +135,9 @@ def _bar(config: EvaluateCommand, problems: tuple[Floats, Floats]) -> tqdm[Any]:
 
 def _backend_options(config: EvaluateCommand) -> dict[str, Any]:
     """What was asked of the backend. Raises :class:`InvalidSetting` for what another one would take."""
+    if config.backend == "kinematic":
+        for key, value in changed("loop", config.loop) + changed("motion", config.motion):
+            raise InvalidSetting(key, value, "left out with backend=kinematic, which plans no motions; or backend=noisy or bullet")
     owners = {"grasp": "bullet", "missed_grasps": "noisy"}
     given = {name: getattr(config, name) for name in owners if getattr(config, name) is not None}
     for name, value in given.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from marl_handover.arrays import wrap
 from marl_handover.cell import NO_ARM
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.config import CellConfig, NoiseConfig, require_seed
-from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, WorkFailed
+from marl_handover.config import CellConfig, LoopConfig, MotionConfig, NoiseConfig, require_seed
+from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, WorkFailed
 from marl_handover.policies import SupervisorPolicy, adapted
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Outcome, Rules
+
+if TYPE_CHECKING:
+    from marl_handover.motion.planner import MotionPlanner
 
 Floats = NDArray[np.float64]
 
@@ -38,6 +41,7 @@ class PlanConfig:
     picture: str = ""  # file for a picture of the sequence: .png, .pdf or .svg
     motion: str = ""  # file for the arms' motions: timed joint trajectories of every transfer
     motion_picture: str = ""  # file for a picture of them: .png, .pdf or .svg
+    arm_motion: MotionConfig = field(default_factory=MotionConfig)  # how the arms move, for motion and motion_picture
 
 
 SCHEMA: type = PlanConfig
@@ -52,6 +56,9 @@ def run(config: PlanConfig) -> int:
     for name in ("picture", "motion_picture"):
         if getattr(config, name):
             require_picture(name, getattr(config, name))
+    for name in ("json", "picture", "motion", "motion_picture"):
+        if getattr(config, name) and Path(getattr(config, name)).is_dir():
+            raise InvalidSetting(name, getattr(config, name), "a file, not a folder")
     require_seed(config.seed)
     poses = {name: _pose(name, getattr(config, name)) for name in ("start", "goal")}
     policy = _policy(config)
@@ -61,10 +68,11 @@ def run(config: PlanConfig) -> int:
             reached = bool(rules.cell.reaches(pose).any())
         if not reached:
             raise OutOfReach(name, (float(pose[0]), float(pose[1])), rules.cell.r_min_mm, rules.cell.r_max_mm)
+    planner = _planner(config, rules)
     plan = solve(policy, poses["start"], poses["goal"])
     print(_text(plan, rules))
-    if config.motion or config.motion_picture:
-        _move(config, plan, rules)  # first: if there is no motion, nothing is written
+    if planner is not None:
+        _move(config, plan, planner)  # first: if there is no motion, nothing is written
     if config.json:
         write_json(Path(config.json), plan, "json")
     if config.picture:
@@ -76,20 +84,16 @@ def run(config: PlanConfig) -> int:
     return 0
 
 
-def _move(config: PlanConfig, plan: dict[str, Any], rules: Rules) -> None:
+def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> None:
     """Plan the motion of every transfer that was not refused, say what it is, and write it as file and picture.
 
     Raises:
         NoMotion: if one of them has no collision-free motion; then nothing is written.
     """
-    # The planner is imported here: without motions, this command needs no compiled functions.
-    from marl_handover.cell import build_cell
     from marl_handover.motion.overlap import overlapped
-    from marl_handover.motion.planner import MotionPlanner
     from marl_handover.report.files import save_figure, write_json
     from marl_handover.runtime.motions import motion_row, plan_motions
 
-    planner = MotionPlanner(build_cell(rules.cell.config))
     planner.warm_up()
     done = [transfer for transfer in plan["transfers"] if not transfer["refused"]]
     orders = [(ARM_LETTERS.index(t["arm"]), np.array(t["from"][:2]), np.array(t["to"][:2])) for t in done]
@@ -97,7 +101,7 @@ def _move(config: PlanConfig, plan: dict[str, Any], rules: Rules) -> None:
     for number, motion in enumerate(motions, start=1):
         print(
             f"motion {number}: arm {ARM_LETTERS[motion.arm]}, {motion.duration_s:.2f} s, grip path {motion.path_length_mm:.1f} mm, "
-            f"clearance {motion.min_clearance_mm:.1f} mm, planned in {motion.planning_ms:.1f} ms"
+            f"clearance to the other arm {motion.min_clearance_mm:.1f} mm, planned in {motion.planning_ms:.1f} ms"
         )
     schedule = overlapped(planner, motions)
     if len(motions) > 1:
@@ -111,6 +115,30 @@ def _move(config: PlanConfig, plan: dict[str, Any], rules: Rules) -> None:
         from marl_handover.report.motion import motion_figure
 
         save_figure(motion_figure(motions, planner.model, planner.motion), Path(config.motion_picture), "motion_picture")
+
+
+def _planner(config: PlanConfig, rules: Rules) -> MotionPlanner | None:
+    """The arms' planner; None if no motion is asked for. Refuses settings it cannot use, under their key here, ``arm_motion``."""
+    if not (config.motion or config.motion_picture):
+        for key, value in changed("arm_motion", config.arm_motion):
+            raise InvalidSetting(key, value, "left out without motion=FILE or motion_picture=FILE")
+        return None
+    # The planner is imported here: without motions, this command needs no compiled functions.
+    from marl_handover.cell import build_cell
+    from marl_handover.motion.planner import MotionPlanner
+
+    try:
+        return MotionPlanner(build_cell(rules.cell.config), config.arm_motion)
+    except InvalidSetting as error:
+        raise InvalidSetting(f"arm_{error.name}", error.value, error.limit) from error
+    except UnknownChoice as error:
+        raise UnknownChoice(f"arm_{error.name}", error.value, error.choices) from error
+
+
+def changed(name: str, settings: LoopConfig | MotionConfig) -> list[tuple[str, Any]]:
+    """Key and value of every setting of group ``name`` that is not the default."""
+    usual = asdict(type(settings)())
+    return [(f"{name}.{key}", value) for key, value in asdict(settings).items() if value != usual[key]]
 
 
 def solve(policy: SupervisorPolicy, start: Floats, goal: Floats) -> dict[str, Any]:

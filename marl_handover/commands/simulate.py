@@ -1,12 +1,12 @@
-"""``marl-handover simulate``: closed-loop episodes in PyBullet, to read and to watch."""
+"""``marl-handover simulate``: episodes in PyBullet, to read and to watch. Each ends at the first verdict, as in the environments."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,10 +15,10 @@ from tqdm import tqdm
 
 from marl_handover import policies
 from marl_handover.arrays import wrap
-from marl_handover.cell import build_cell
+from marl_handover.cell import Cell, build_cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import CellConfig, MotionConfig, TaskChanges, require_at_least, require_seed
-from marl_handover.errors import InvalidSetting, WorkFailed
+from marl_handover.errors import InvalidSetting, OutOfReach, WorkFailed
 
 if TYPE_CHECKING:
     from marl_handover.envs.handover_aec import HandoverEnv
@@ -34,12 +34,12 @@ class SimulateCommand:
     """Settings of ``simulate``. What is not given is the policy's own, or the default."""
 
     policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
-    episodes: int = 1  # played one after the other
+    episodes: int = 1  # played one after the other; each ends at the first verdict
     seed: int = 0  # of the problems
     start: list[float] | None = None  # x [mm], y [mm], orientation [deg]; null: random
     goal: list[float] | None = None  # the same; null: random
     cell: CellConfig | None = None  # single keys change the paper cell
-    task: TaskChanges = field(default_factory=TaskChanges)
+    task: TaskChanges = field(default_factory=TaskChanges)  # but for the noise: physics decides
     motion: MotionConfig = field(default_factory=MotionConfig)
     grasp: str = "friction"  # friction, or constraint: a rigid joint while both fingers are on the pin
     video: str = ""  # .mp4 or .gif
@@ -72,6 +72,8 @@ def run(config: SimulateCommand) -> int:
     views = {"overview": OVERVIEW, "top": TOP}
     width, height = _check(config, tuple(views))
     policy = policies.adapted(config.policy, config.cell, config.seed, **vars(config.task))
+    for name in ("start", "goal"):
+        _require_reach(policy.rules.cell, name, getattr(config, name))
     model = build_cell(policy.rules.cell.config)
     backend = BulletBackend(model, config.motion, grasp=config.grasp, gui=config.gui, camera=views[config.view], size=(width, height))
     try:
@@ -102,19 +104,26 @@ def _check(config: SimulateCommand, views: tuple[str, ...]) -> tuple[int, int]:
         raise InvalidSetting("size", list(config.size), "two even numbers of pixels, 16 to 4096: [width, height]")
     for name in ("start", "goal"):
         pose = getattr(config, name)
-        if pose is not None and len(pose) != 3:
-            raise InvalidSetting(name, list(pose), "[x_mm, y_mm, degrees]")
+        if pose is not None and not (len(pose) == 3 and all(math.isfinite(number) for number in pose)):
+            raise InvalidSetting(name, list(pose), "three finite numbers: [x_mm, y_mm, degrees]")
+    if config.task.noise is not None:
+        raise InvalidSetting("task.noise", asdict(config.task.noise), "left out: physics decides")
+    config.motion.validate()
     if config.video:
         require_video("video", config.video)
     return config.size[0], config.size[1]
+
+
+def _require_reach(cell: Cell, name: str, pose: list[float] | None) -> None:
+    if pose is not None and not cell.reaches(np.array(pose)).any():
+        raise OutOfReach(name, (pose[0], pose[1]), cell.r_min_mm, cell.r_max_mm)
 
 
 @contextmanager
 def _recording(config: SimulateCommand, backend: BulletBackend) -> Iterator[Video | None]:
     """The video, if one is asked for; it gets a frame whenever one is due while arms move."""
     if not config.video:
-        with nullcontext():
-            yield None
+        yield None
         return
     from marl_handover.simulation.video import FrameClock, Video
     from marl_handover.simulation.world import CONTROL_S
@@ -145,7 +154,8 @@ def _episodes(
     for key, given in (("state", config.start), ("goal", config.goal)):
         if given is not None:
             problem[key] = [given[0], given[1], float(wrap(math.radians(given[2])))]
-    with tqdm(total=config.episodes, unit="episode", disable=not config.progress, leave=False) as bar:
+    hidden = None if config.progress else True  # None: shown on a terminal only; a file would keep what the bar wipes out
+    with tqdm(total=config.episodes, unit="episode", disable=hidden, leave=False) as bar:
         for episode in range(config.episodes):
             env.reset(seed=config.seed if episode == 0 else None, options=problem or None)
             backend.cell.show_goal(env.observe("supervisor")["goal"])

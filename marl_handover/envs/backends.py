@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from marl_handover.arrays import wrap
 from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig, NoiseConfig, TaskConfig, require_at_least, require_between, require_choice
-from marl_handover.envs.cycle_check import CycleCheck, Refusal
+from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
 from marl_handover.envs.top_view import TopView
+from marl_handover.errors import InvalidSetting
 from marl_handover.motion.trajectory import CyclePaths
 from marl_handover.task.rules import carried
 
@@ -82,14 +83,16 @@ class KinematicBackend:
     Args:
         model: the cell.
         motion: the parked pose and the splines' degree.
-        check_collisions: says whether a cycle touches anything; None leaves that to the arms.
+        check_collisions: True: a cycle that touches anything is refused (:class:`~marl_handover.envs.collision_check.CollisionFinder`).
+            False: that is left to the arms, and a path through the table or the other arm is carried out. Or a check of one's own.
     """
 
     exact = True
 
-    def __init__(self, model: CellModel, motion: MotionConfig, *, check_collisions: CollisionCheck | None = None) -> None:
-        self.model, self.motion, self.check_collisions = model, motion, check_collisions
+    def __init__(self, model: CellModel, motion: MotionConfig, *, check_collisions: CollisionCheck | bool = False) -> None:
+        self.model, self.motion = model, motion
         self.check = CycleCheck(model, motion)
+        self.check_collisions = _collision_check(check_collisions, model, motion)
         self._joints = np.tile(self.check.parked_rad, (model.cell.num_arms, 1))
         self._pose = np.zeros(3)
         self._view: TopView | None = None
@@ -115,6 +118,7 @@ class KinematicBackend:
             refusal = Refusal.COLLISION
         if refusal is not None:
             return Execution(self._pose.copy(), self.joints_rad(), 0.0, refusal)
+        paths = welded(paths)
         self._joints[arm] = paths.retreat[-1]
         return self._moved(arm, paths.transfer)
 
@@ -131,6 +135,18 @@ class KinematicBackend:
         end = self.check.grip_mm(arm, transfer[-1])
         self._pose = carried(self._pose, end[:2], transfer[-1, 0] - transfer[0, 0])
         return Execution(self._pose.copy(), self.joints_rad(), self.check.path_mm(arm, transfer), None)
+
+
+def _collision_check(check: CollisionCheck | bool, model: CellModel, motion: MotionConfig) -> CollisionCheck | None:
+    if callable(check):
+        return check
+    if not isinstance(check, bool):
+        raise InvalidSetting("check_collisions", check, "true, false, or a function")
+    if not check:
+        return None
+    from marl_handover.envs.collision_check import CollisionFinder  # compiles; without it the environments need no compiler
+
+    return CollisionFinder(model, motion)
 
 
 class NoisyBackend(KinematicBackend):
@@ -153,7 +169,7 @@ class NoisyBackend(KinematicBackend):
         *,
         noise: NoiseConfig | None = None,
         missed_grasps: float = 0.01,
-        check_collisions: CollisionCheck | None = None,
+        check_collisions: CollisionCheck | bool = False,
     ) -> None:
         super().__init__(model, motion, check_collisions=check_collisions)
         noise = noise or NoiseConfig(position_mm=1.0, yaw_deg=0.5)

@@ -63,10 +63,11 @@ class CycleCheck:
         motion: the parked pose and the splines' degree.
 
     Raises:
-        InvalidSetting: for a pose the arm cannot park in, or control points too few for the degree.
+        InvalidSetting: for a setting of ``motion`` out of its limits, or a pose the arm cannot park in.
     """
 
     def __init__(self, model: CellModel, motion: MotionConfig) -> None:
+        motion.validate()
         self.model, self.motion = model, motion
         knots(motion.control_points, motion.degree)  # refuses settings that are no spline
         self.parked_rad = np.radians(motion.parked_deg)
@@ -125,6 +126,13 @@ class CycleCheck:
         across = 0.0 if place_mm is None else math.hypot(x - place_mm[0], y - place_mm[1])
         distance = math.hypot(across, z - self.model.cell.config.pick_height_mm)
         return distance <= END_TOLERANCE_MM and max(abs(pitch), abs(roll)) <= LEVEL_TOLERANCE_RAD
+
+
+def welded(paths: CyclePaths) -> CyclePaths:
+    """The same cycle, each path beginning exactly where the one before ends; the check lets :data:`JOIN_TOLERANCE_RAD` pass."""
+    transfer, retreat = paths.transfer.copy(), paths.retreat.copy()
+    transfer[0], retreat[0] = paths.approach[-1], transfer[-1]
+    return CyclePaths(paths.approach, transfer, retreat)
 
 
 def _apart(one: Floats, other: Floats) -> float:

@@ -19,7 +19,7 @@ from pettingzoo import AECEnv
 from pettingzoo.utils import wrappers
 
 from marl_handover.cell import CellModel, build_cell, cell_config
-from marl_handover.config import CellConfig, MotionConfig, NoiseConfig, TaskConfig, require_between, require_choice
+from marl_handover.config import CellConfig, LoopConfig, MotionConfig, NoiseConfig, TaskConfig, require_between, require_choice
 from marl_handover.envs.actions import read_command, read_cycle
 from marl_handover.envs.backends import Backend, Correctable, KinematicBackend, make_backend
 from marl_handover.envs.cycle_check import FAILURES, CycleCheck, Refusal
@@ -68,6 +68,11 @@ class HandoverEnv(AECEnv):
     answer is then ignored. A refused transfer counts as an infeasible one; one that failed on the way (:data:`FAILURES`) is judged by
     where it left the object.
 
+    ``kinematic`` and ``noisy`` arms look at a path's ends and joint limits only: **nothing is checked for collision**, and one through the
+    table or the other arm is carried out, unless ``backend_options={"check_collisions": True}`` (some milliseconds a transfer).
+
+    On arms that are not exact, hand-overs keep to ``LoopConfig.chart_inset`` of the chart, as in the closed loop.
+
     Args:
         backend: ``kinematic``, ``noisy``, ``bullet``, or one of your own.
         cell: a shipped cell's name, a YAML path, settings, or a cell that is built already.
@@ -105,9 +110,12 @@ class HandoverEnv(AECEnv):
             backend = make_backend(backend, self.model, task, motion, **(backend_options or {}))
         self.backend = backend
         cost = motion_cost(self.model.cell, task, motion)
-        self.rules = Rules(self.model.cell, replace(task, noise=NoiseConfig()), cost, physical=not self.backend.exact)
+        # On arms that are not exact, hand-overs keep to the part of the chart that the closed loop keeps to.
+        own = self.model.cell.config.chart_inset
+        played = self.model.cell.with_inset(own if self.backend.exact else min(own, LoopConfig().chart_inset))
+        self.rules = Rules(played, replace(task, noise=NoiseConfig()), cost, physical=not self.backend.exact)
         self.check = CycleCheck(self.model, motion)
-        self.problems = ProblemSource(self.model.cell)
+        self.problems = ProblemSource(played)
         self.spaces = Spaces(self.model, motion)
         self.possible_agents = list(self.spaces.action)
         self.agents: list[str] = []
@@ -125,6 +133,7 @@ class HandoverEnv(AECEnv):
         """Start an episode. ``options={"state": [x_mm, y_mm, theta_rad], "goal": [...]}`` sets the problem, else it is random.
 
         Raises:
+            UnknownKey, InvalidSetting: for another option, or a pose that is not three numbers.
             OutOfReach, NotFinite: for a state or goal that cannot be.
         """
         if seed is not None or self._random is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 
 from marl_handover.arrays import wrap
 from marl_handover.cell import Cell
-from marl_handover.errors import NotFinite, OutOfReach
+from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownKey
 from marl_handover.task.problems import sample_problems
 
 Floats = NDArray[np.float64]
+
+KEYS = ("state", "goal")
+"""Of the options that set a problem."""
+
+IGNORED = "options"
+"""A key that PettingZoo's own API test sends."""
 
 FIRST_DRAW, LARGEST_DRAW = 16, 1024
 """Problems are drawn in blocks, since one batched draw costs as much as one single draw: small ones first, for who seeds every episode."""
@@ -36,23 +42,36 @@ class ProblemSource:
         """Start and goal, each (3,): random, or as ``options`` say under ``state`` and ``goal``.
 
         Raises:
-            NotFinite, OutOfReach: for a state or goal that cannot be.
+            UnknownKey: for another key.
+            InvalidSetting: for a state or goal that is not three numbers.
+            NotFinite, OutOfReach: for one that cannot be.
         """
+        given = self._given({} if options is None else options)
         if not self._drawn:
             drawn = sample_problems(self.cell, self._block, torch.Generator().manual_seed(int(generator.integers(2**62))))
             self._drawn = list(zip(*(poses.numpy() for poses in drawn), strict=True))
             self._block = min(8 * self._block, LARGEST_DRAW)
         start, goal = self._drawn.pop()
-        options = options or {}
-        return (
-            self._checked("state", options["state"]) if "state" in options else start,
-            self._checked("goal", options["goal"]) if "goal" in options else goal,
-        )
+        return given.get("state", start), given.get("goal", goal)
 
-    def _checked(self, what: str, pose: Sequence[float]) -> Floats:
-        array = np.asarray(pose, np.float64)
-        if array.shape != (3,) or not np.isfinite(array).all():
-            raise NotFinite(what, list(pose))
+    def _given(self, options: Mapping[str, Any]) -> dict[str, Floats]:
+        if not isinstance(options, Mapping):
+            raise InvalidSetting("options", options, "a mapping with the keys state and goal, or None")
+        for key in options:
+            if key not in (*KEYS, IGNORED):
+                raise UnknownKey(str(key), KEYS)
+        return {key: self._checked(key, options[key]) for key in KEYS if key in options}
+
+    def _checked(self, what: str, pose: Any) -> Floats:
+        expected = "three numbers: [x_mm, y_mm, theta_rad]"
+        try:
+            array = np.asarray(pose, np.float64)
+        except (TypeError, ValueError, ArithmeticError, RuntimeError) as error:  # what numpy and torch find wrong with it
+            raise InvalidSetting(what, pose, expected) from error
+        if array.shape != (3,):
+            raise InvalidSetting(what, pose, expected)
+        if not np.isfinite(array).all():
+            raise NotFinite(what, array.tolist())
         if not self.cell.reaches(array).any():
             raise OutOfReach(what, (float(array[0]), float(array[1])), self.cell.r_min_mm, self.cell.r_max_mm)
         return np.array([array[0], array[1], wrap(array[2])])

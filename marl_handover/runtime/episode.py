@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.arrays import wrap
 from marl_handover.envs.cycle_check import FAILURES
 from marl_handover.task.rules import Outcome
 
@@ -15,6 +16,11 @@ Floats = NDArray[np.float64]
 
 SAME_MM, SAME_RAD = 0.01, 1e-4
 """Poses nearer than this are the same: nothing was moved."""
+
+
+def moved(before: Floats, after: Floats) -> bool:
+    """Whether an object measured at pose ``before`` (3,) is elsewhere, or turned, at ``after`` (3,)."""
+    return bool(abs(after[:2] - before[:2]).max() >= SAME_MM or abs(wrap(after[2] - before[2])) >= SAME_RAD)
 
 
 class Done(NamedTuple):
@@ -33,7 +39,10 @@ class Done(NamedTuple):
 
     @property
     def tried(self) -> bool:
-        """Whether the transfer took place, well or badly; else it was refused."""
+        """Whether the transfer took place, well or badly, and is judged by where the object lies.
+
+        Else it was refused, or left an object that had better not be handled, as after a collision; that may have moved too.
+        """
         return self.refusal is None or self.refusal in FAILURES
 
 
@@ -92,8 +101,7 @@ class Transfer:
         mine, its = self.order, other.order
         if self.done.tried or other.done.tried or (mine.arm, mine.final) != (its.arm, its.final):
             return False
-        moved = abs(self.before - other.before)
-        return bool(moved[:2].max() < SAME_MM and moved[2] < SAME_RAD and abs(mine.place_mm - its.place_mm).max() < SAME_MM)
+        return not moved(self.before, other.before) and bool(abs(mine.place_mm - its.place_mm).max() < SAME_MM)
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,12 @@ from marl_handover.config import LoopConfig, MotionConfig
 from marl_handover.envs.backends import Backend, make_backend
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.errors import HandoverError
+from marl_handover.motion.cost import motion_cost
 from marl_handover.motion.executor import ROLL_RAD
-from marl_handover.motion.planner import MotionPlanner, OutOfArmsReach
-from marl_handover.motion.trajectory import TransferMotion
+from marl_handover.motion.planner import MotionPlanner
+from marl_handover.motion.trajectory import OutOfArmsReach, TransferMotion
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.runtime.episode import Done, Episode, Order, Transfer
+from marl_handover.runtime.episode import Done, Episode, Order, Transfer, moved
 from marl_handover.runtime.reach import drawn_in
 from marl_handover.task.rules import Outcome, Rules, Verdict
 
@@ -59,13 +60,16 @@ class ClosedLoop:
         planner: of the arms' motions.
         backend: what carries them out.
         settings: limits of the loop.
+
+    Raises:
+        InvalidSetting: on a limit out of its own, or fewer transfers than the rules' ``max_steps``.
     """
 
     def __init__(self, policy: SupervisorPolicy, planner: MotionPlanner, backend: Backend, settings: LoopConfig | None = None) -> None:
         self.policy, self.planner, self.backend, self.settings = policy, planner, backend, settings or LoopConfig()
-        self.settings.validate()
         self.rules: Rules = policy.rules
-        self.limit = max(self.settings.transfers, self.rules.config.max_steps)
+        self.settings.validate(self.rules.config.max_steps)
+        self.limit = self.settings.transfers
 
     def __enter__(self) -> Self:
         return self
@@ -135,7 +139,7 @@ class ClosedLoop:
         reward, terminated, outcome = float(verdict.reward), bool(verdict.terminated), Outcome(int(verdict.outcome))
         run.transfers.append(Transfer(run.attempt, order, run.pose, run.previous, done, reward, terminated, False, outcome))
         run.pose = done.pose
-        if done.tried:
+        if done.tried or moved(run.transfers[-1].before, done.pose):
             run.previous = order.arm
 
     def _move(self, pose: Floats, order: Order, seen: Floats) -> Done:
@@ -152,14 +156,20 @@ class ClosedLoop:
 
     def _plan(self, order: Order, pose: Floats, seen: Floats) -> TransferMotion:
         joints = self.backend.joints_rad()
-        joints[abs(joints[:, 4]) <= ROLL_RAD, 4] = 0.0
-        own, other = joints[order.arm], np.delete(joints, order.arm, axis=0)[0]
+        own, other = self._settled(joints[order.arm]), np.delete(joints, order.arm, axis=0)[0]
         try:
             return self.planner.cycle(order.arm, pose[:2], order.place_mm, own, other)
         except OutOfArmsReach:
             if np.array_equal(seen, pose):
                 raise
             return self.planner.cycle(order.arm, seen[:2], order.place_mm, own, other)
+
+    def _settled(self, joints_rad: Floats) -> Floats:
+        """An arm's measured joints (5,) as a plan can begin with: a servo's droop past a limit or off roll 0 is taken away."""
+        arm = self.planner.model.arm
+        wanted = np.clip(joints_rad, arm.lower_rad, arm.upper_rad)
+        wanted[4] = 0.0
+        return np.where(abs(wanted - joints_rad) <= ROLL_RAD, wanted, joints_rad)
 
     def _room(self, run: _Run) -> int:
         """Transfers by which the present attempt has to end."""
@@ -194,8 +204,8 @@ def make_loop(
 ) -> ClosedLoop:
     """A closed loop around a policy, in the policy's own cell.
 
-    On arms that are not exact, placements are judged with their tolerance, and the hand-overs keep away from the edge of the shared space:
-    ``settings.chart_inset``.
+    Transfers are priced as these arms move. On arms that are not exact, placements are judged with their tolerance, and the hand-overs
+    keep away from the edge of the shared space: ``settings.chart_inset``.
 
     Args:
         policy: the supervisor.
@@ -208,11 +218,12 @@ def make_loop(
         UnknownChoice, InvalidSetting: for a name or a setting that cannot be.
     """
     motion, settings = motion or MotionConfig(), settings or LoopConfig()
-    settings.validate()
+    settings.validate(policy.rules.config.max_steps)
     model = build_cell(policy.rules.cell.config)
     planner = MotionPlanner(model, motion)
     planner.warm_up()
     made = make_backend(backend, model, policy.rules.config, motion, **options)
     cell = model.cell if made.exact else model.cell.with_inset(min(settings.chart_inset, model.cell.config.chart_inset))
-    rules = Rules(cell, policy.rules.config, policy.rules.motion_cost, physical=not made.exact)
+    price = motion_cost(cell, policy.rules.config, motion)
+    rules = Rules(cell, policy.rules.config, price, physical=not made.exact)
     return ClosedLoop(policy.under(rules), planner, made, settings)

@@ -47,7 +47,7 @@ def plan_motions(planner: MotionPlanner, transfers: Iterable[tuple[int, Floats, 
 
 
 def motion_row(motion: TransferMotion) -> dict[str, Any]:
-    """One entry of ``transfers`` in the motion file: mm, rad, s."""
+    """One entry of ``transfers`` in the motion file: mm, rad, s; ``min_clearance_mm`` is the moving arm's to the other one."""
     phases = [{"name": p.name, "t_s": p.t_s.tolist(), "joints_rad": p.joints_rad.tolist()} for p in motion.phases]
     return {
         "arm": ARM_LETTERS[motion.arm],

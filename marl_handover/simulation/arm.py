@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import pybullet
 
 from marl_handover.cell.build import urdf_path
 from marl_handover.cell.cell import Base
 from marl_handover.cell.kinematics import ArmModel
 from marl_handover.cell.urdf import ARM_JOINTS
-from marl_handover.simulation.engine import Engine, Floats, Surface, force, length, to_mm, torque
+from marl_handover.simulation.engine import Engine, Floats, Surface, force, length, pybullet, to_mm, torque
 
 GRIP_FORCE_N = 2.0
 """What each finger closes with: plenty for a block of 16 g. The servo could ten times as much, and would bend the pin."""

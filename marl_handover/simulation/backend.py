@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.envs.backends import Execution
-from marl_handover.envs.cycle_check import CycleCheck, Refusal
+from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
 from marl_handover.motion.cycle import timed_phases
 from marl_handover.motion.trajectory import CyclePaths, Phase
 from marl_handover.simulation.camera import TOP, Camera
@@ -73,7 +73,7 @@ class BulletBackend:
         refusal = self.check(arm, paths, self.joints_rad()[arm], self.cell.object_pose()[:2])
         if refusal is not None:
             return Execution(self.cell.object_pose(), self.joints_rad(), 0.0, refusal)
-        return self.carry_out(arm, timed_phases(paths, self.model.arm, self.motion, self.model.cell.config.pick_height_mm))
+        return self.carry_out(arm, timed_phases(welded(paths), self.model.arm, self.motion, self.model.cell.config.pick_height_mm))
 
     def carry_out(self, arm: int, phases: tuple[Phase, ...]) -> Execution:
         """The same for a cycle that is timed already, and taken as it is."""
@@ -84,14 +84,14 @@ class BulletBackend:
         return Execution(self.cell.object_pose(), self.joints_rad(), length_mm, self._failure(arm, self.last))
 
     def _failure(self, arm: int, report: RunReport) -> Refusal | None:
-        """What went wrong, worst first."""
+        """What went wrong, worst first: whatever else happened, nobody can grip a block that has tipped over."""
+        if self.cell.tilt_rad() > UPRIGHT_RAD:
+            return Refusal.TIPPED
         if report.collisions:
             return Refusal.COLLISION
         if not report.arms[arm].grasped:
             return Refusal.MISSED_GRASP
-        if not report.arms[arm].kept:
-            return Refusal.DROPPED
-        return Refusal.TIPPED if self.cell.tilt_rad() > UPRIGHT_RAD else None
+        return None if report.arms[arm].kept else Refusal.DROPPED
 
     def render(self) -> NDArray[np.uint8]:
         """A picture through :attr:`camera`: RGB (height, width, 3)."""

@@ -6,10 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-import pybullet
 
 from marl_handover.config import BlockConfig
-from marl_handover.simulation.engine import Engine, Floats, Surface, inertia, length, tilt_of, to_mm, yaw_of
+from marl_handover.simulation.engine import Engine, Floats, Surface, inertia, length, pybullet, tilt_of, to_mm, yaw_of
 
 _BEAD_SPACING_MM = 6.0
 _WOOD_KG_MM3 = 650e-9

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from marl_handover.config import require_at_least
-from marl_handover.simulation.engine import Engine, length
+from marl_handover.simulation.engine import Engine, length, pybullet
 
 Pixels = NDArray[np.uint8]
 

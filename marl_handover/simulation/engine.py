@@ -6,18 +6,53 @@ than they are. Only this module knows the factor. Masses and seconds stay, so fo
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from marl_handover.errors import WorkFailed
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Nothing that C code prints in this block comes out; what was printed before does, and in its order."""
+    try:
+        kept = {number: os.dup(number) for number in (1, 2)}
+    except OSError:  # no standard streams, nothing to silence
+        yield
+        return
+    _flush()
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            for number in kept:
+                os.dup2(nowhere.fileno(), number)
+        yield
+    finally:
+        _flush()
+        for number, copy in kept.items():
+            os.dup2(copy, number)
+            os.close(copy)
+
+
+def _flush() -> None:
+    """Empty the buffers of Python's streams and of C's."""
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:
+            stream.flush()
+    with suppress(OSError, TypeError, AttributeError):  # a system without a C library in the process
+        ctypes.CDLL(None).fflush(None)
+
+
+with _silent():  # it prints when it was built; the package's other modules take it from here
+    import pybullet
 
 Floats = NDArray[np.float64]
 

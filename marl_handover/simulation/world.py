@@ -9,7 +9,6 @@ from types import TracebackType
 from typing import NamedTuple, Self
 
 import numpy as np
-import pybullet
 from numpy.typing import ArrayLike
 
 from marl_handover.cell.build import CellModel
@@ -18,7 +17,7 @@ from marl_handover.motion.trajectory import Phase
 from marl_handover.simulation.arm import SERVO_S, SimulatedArm
 from marl_handover.simulation.block import Block, draw_goal
 from marl_handover.simulation.camera import TOP, Camera, Pixels, picture
-from marl_handover.simulation.engine import COARSE, FINE, Engine, Floats, Surface, Touch, length
+from marl_handover.simulation.engine import COARSE, FINE, Engine, Floats, Surface, Touch, length, pybullet
 
 GRASPS = ("friction", "constraint")
 CONTROL_S = 0.02
@@ -83,16 +82,15 @@ class BulletCell:
         motion: where the arms park, and how far the fingers open.
         grasp: "friction" (finger contact alone) or "constraint" (a rigid joint while both fingers are on the pin).
         gui: open PyBullet's window.
-        seed: unused by the physics, which draws nothing at random; kept as :attr:`seed`.
 
     Raises:
         UnknownChoice: for another ``grasp``.
         NoWindow: if ``gui`` and there is no display.
     """
 
-    def __init__(self, model: CellModel, motion: MotionConfig, *, grasp: str = "friction", gui: bool = False, seed: int = 0) -> None:
+    def __init__(self, model: CellModel, motion: MotionConfig, *, grasp: str = "friction", gui: bool = False) -> None:
         require_choice("grasp", grasp, GRASPS)
-        self.model, self.motion, self.grasp, self.seed = model, motion, grasp, seed
+        self.model, self.motion, self.grasp = model, motion, grasp
         self.parked_rad = np.radians(motion.parked_deg)
         self.engine = Engine(gui)
         self.reset((0.0, 0.0, 0.0))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from marl_handover import policies
 from marl_handover.cell import load_cell
 from marl_handover.cli import main
 from marl_handover.compose import compose
-from marl_handover.config import TaskConfig
+from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.learning import evaluation
 from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.learning.trainer import Trainer
+from marl_handover.motion.cost import cache_file, cost_table, settings_key
 from marl_handover.task.rules import Rules
 
 FIELDS = {
@@ -326,6 +328,26 @@ def test_a_few_problems_in_the_simulated_cell(tmp_path):
     assert 0 < max(math.dist(line["next_state"][:2], line["place"]) for line in lines) < 5.0  # measured, not commanded
 
 
+def test_the_loops_defaults_may_be_spelled_out_anywhere(tmp_path):
+    evaluated(tmp_path, "episodes=2", "loop.transfers=30", "motion.lift_mm=40")
+
+
+def test_transfers_are_priced_as_the_arms_move(tmp_path, monkeypatch):
+    """By a table for these motion settings, kept where the package looks for it, in which every way is 700 mm long."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    cell, motion = load_cell(), MotionConfig(lift_mm=31.0)
+    usual = cost_table(cell, MotionConfig())
+    table = replace(usual, key=settings_key(cell, motion), string_mm=0 * usual.string_mm + 700.0, excess_mm=0 * usual.excess_mm)
+    cache_file(table.key).parent.mkdir(parents=True)
+    table.save(cache_file(table.key))
+    quiet = ("task.noise.position_mm=0", "task.noise.yaw_deg=0", "missed_grasps=0")
+    weight = ("task.reward.motion_weight=0.5", "motion.lift_mm=31")
+    plain, priced = (evaluated(tmp_path, "backend=noisy", "episodes=2", *quiet, *extra)[1] for extra in (weight[1:], weight))
+    firsts = [next(line for line in lines if line["step"] == 0) for lines in (plain, priced)]
+    assert firsts[1]["place"] == firsts[0]["place"]
+    assert firsts[0]["reward"] - firsts[1]["reward"] == pytest.approx(0.5 * 700 / 100)
+
+
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
@@ -337,6 +359,13 @@ def test_a_few_problems_in_the_simulated_cell(tmp_path):
         (["backend=noisy", "loop.transfers=0"], "loop.transfers"),
         (["backend=noisy", "motion.lift_mm=nan"], "motion.lift_mm"),
         (["backend=noisy", "motion.parked_deg=[0,0,0,0,0]"], "motion.parked_deg"),
+        (["backend=noisy", "loop.edge_mm=2"], "loop.edge_mm"),
+        (["backend=noisy", "max_steps=31"], "loop.transfers = 30: must be at least task.max_steps = 31"),
+        (["backend=kinematic", "loop.transfers=-4", "motion.method=nonsense", "motion.lift_mm=-5"], "loop.transfers = -4"),
+        (["loop.edge_mm=0.5"], "left out with backend=kinematic"),
+        (["motion.method=paper"], "motion.method"),
+        (["motion.parked_deg=[0,120,-115,70,0]"], "motion.parked_deg"),
+        (["motion.lift_mm=nan"], "motion.lift_mm"),
     ],
 )
 def test_backends_refuse_what_they_cannot_use(capsys, arguments, word):

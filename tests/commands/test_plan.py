@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from marl_handover import cli
+from marl_handover.cell import build_cell, cell_config
 from marl_handover.commands.plan import solve
 from marl_handover.policies import ExactPolicy
 
@@ -105,6 +106,10 @@ def test_a_policy_that_fails_says_how_and_still_writes(tmp_path, capsys):
         (["cell=papr"], "paper"),
         (["picture=plan.gif"], ".png, .pdf or .svg"),
         (["end=[0,0,0]"], "unknown key 'end'"),
+        (["motion=m.json", "arm_motion.lift_mm=-5"], "arm_motion.lift_mm = -5.0"),
+        (["motion=m.json", "arm_motion.method=magic"], "arm_motion.method = 'magic' is not known"),
+        (["motion=m.json", "arm_motion.parked_deg=[0,0,0,0,0]"], "arm_motion.parked_deg = [0.0, 0.0, 0.0, 0.0, 0.0]"),
+        (["arm_motion.lift_mm=50"], "arm_motion.lift_mm = 50.0: must be left out without motion=FILE"),
     ],
 )
 def test_bad_input_is_one_line(capsys, recwarn, arguments, said):
@@ -115,6 +120,17 @@ def test_bad_input_is_one_line(capsys, recwarn, arguments, said):
     assert said in captured.err
     assert captured.err.count("\n") == 1
     assert not [warning for warning in recwarn if issubclass(warning.category, RuntimeWarning)]
+
+
+@pytest.mark.parametrize("key", ["json", "picture", "motion", "motion_picture"])
+def test_a_folder_is_no_file(tmp_path, capsys, key):
+    """Said before anything is planned."""
+    folder = tmp_path / "folder.png"
+    folder.mkdir()
+    assert cli.main(["plan", f"{key}={folder}"]) == 2
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", f"marl-handover plan: {key} = '{folder}': must be a file, not a folder\n")
+    assert not list(folder.iterdir())
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +192,33 @@ def test_a_policy_that_fails_has_motions_of_what_was_not_refused(tmp_path):
     assert cli.main(["plan", "policy=random", "architecture=A", "epsilon_deg=0.001", f"motion={motion}", f"json={plan}"]) == 1
     made = [row for row in json.loads(plan.read_text())["transfers"] if not row["refused"]]
     assert [row["from"] for row in json.loads(motion.read_text())["transfers"]] == [row["from"][:2] for row in made]
+
+
+@pytest.mark.parametrize("lift_mm", [20.0, 60.0])
+def test_the_arms_move_as_they_are_told_to(tmp_path, lift_mm):
+    """The block travels as high as was asked for; over a long way, as over a short one all is smaller."""
+    motion = tmp_path / "motion.json"
+    assert cli.main(["plan", "start=[-120,60,0]", "goal=[60,0,-60]", f"motion={motion}", f"arm_motion.lift_mm={lift_mm}"]) == 0
+    arm = build_cell(cell_config("paper")).arm
+    row = max(json.loads(motion.read_text())["transfers"], key=lambda row: math.dist(row["from"], row["to"]))
+    joints = np.concatenate([phase["joints_rad"] for phase in row["phases"] if phase["name"] == "transfer"])
+    assert arm.fk(joints)[:, 2, 3].max() == pytest.approx(45.0 + lift_mm, abs=2.0)
+
+
+def test_the_papers_method_by_name(tmp_path, capsys):
+    """The same problem with both: the paper's B-spline has its ways too, and they are not the optimiser's."""
+    problem = ["start=[-120,60,0]", "goal=[60,0,-60]"]
+    rows = {}
+    for method in ("optimised", "paper"):
+        motion = tmp_path / f"{method}.json"
+        assert cli.main(["plan", *problem, f"motion={motion}", f"arm_motion.method={method}"]) == 0
+        rows[method] = json.loads(motion.read_text())["transfers"]
+    out = capsys.readouterr().out
+    assert out.count("clearance to the other arm ") == sum(map(len, rows.values()))
+    for optimised, paper in zip(*rows.values(), strict=True):
+        assert (paper["from"], paper["to"]) == (optimised["from"], optimised["to"])
+        assert paper["path_length_mm"] != optimised["path_length_mm"]
+        assert paper["path_length_mm"] == pytest.approx(optimised["path_length_mm"], rel=0.2)
 
 
 def test_a_transfer_without_a_motion_is_one_line_and_nothing_is_written(tmp_path, capsys):

@@ -13,11 +13,15 @@ import pytest
 from marl_handover.arrays import wrap
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import MotionConfig, NoiseConfig, TaskConfig
+from marl_handover.envs.actions import read_cycle
 from marl_handover.envs.backends import Correctable, KinematicBackend, NoisyBackend, Refusal, make_backend
-from marl_handover.envs.cycle_check import CycleCheck
+from marl_handover.envs.collision_check import CollisionFinder
+from marl_handover.envs.cycle_check import JOIN_TOLERANCE_RAD, CycleCheck, welded
 from marl_handover.envs.top_view import BLOCK, GOAL, PLACE, TopView
 from marl_handover.errors import InvalidSetting, UnknownChoice
+from marl_handover.motion.cycle import timed_phases
 from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
+from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import CyclePaths
 from marl_handover.task.rules import Command, Rules
 
@@ -156,6 +160,95 @@ def test_a_collision_check_has_the_last_word(paper_model):
     np.testing.assert_array_equal(execution.pose, START)
     backend.reset(np.array([0.0, 0.0, 0.0]), 0)
     assert backend.execute(1, cycle(paper_model, 1, (0.0, 0.0), (20.0, 10.0))).refusal is None
+
+
+@pytest.fixture(scope="module")
+def careful(paper_model):
+    return KinematicBackend(paper_model, MOTION, check_collisions=True)
+
+
+def bent(paths, path, joint, angle_rad):
+    """The same cycle with the middle control points of one path turned at one joint."""
+    points = getattr(paths, path).copy()
+    points[3:-3, joint] += angle_rad
+    return paths._replace(**{path: points})
+
+
+@pytest.mark.parametrize(
+    ("path", "joint", "angle_deg"),
+    [("transfer", 1, -20.0), ("approach", 1, -60.0), ("retreat", 1, -60.0), ("transfer", 4, 60.0)],
+    ids=["the block into the table", "the hand on its way there", "the hand on its way back", "the block on its side"],
+)
+def test_a_path_through_the_table_is_refused_when_that_is_looked_for(paper_model, careful, path, joint, angle_deg):
+    planned = MotionPlanner(paper_model, MOTION).cycle(0, START[:2], PLACE_MM, PARKED, PARKED).paths
+    diving = bent(planned, path, joint, math.radians(angle_deg))
+    careful.reset(START, 0)
+    execution = careful.execute(0, diving)
+    assert execution.refusal == Refusal.COLLISION
+    np.testing.assert_array_equal(execution.pose, START)
+    assert careful.execute(0, planned).refusal is None
+    assert started(KinematicBackend, paper_model).execute(0, diving).refusal is None
+
+
+def test_a_path_through_the_other_arm_is_refused_when_that_is_looked_for(paper_model):
+    planned = MotionPlanner(paper_model, MOTION).cycle(0, START[:2], PLACE_MM, PARKED, PARKED).paths
+    finder = CollisionFinder(paper_model, MOTION)
+    assert not finder(0, planned, np.array([PARKED, PARKED]))
+    over_the_place = cycle(paper_model, 1, PLACE_MM, PLACE_MM).transfer[0]
+    assert finder(0, planned, np.array([PARKED, over_the_place]))
+
+
+def test_what_the_executor_plans_touches_nothing(paper_model, careful, draw):
+    """Of all transfers within reach, what its float32 action says; straight lines in joint space drag the block over the table."""
+    agents = {method: ExecutorAgent(ARM_AGENTS[0], paper_model, method) for method in ("optimised", "direct")}
+    came = {method: [] for method in agents}
+    for pose, goal in zip(*draw(paper_model.cell, 100, 0)[:2], strict=True):
+        if not paper_model.cell.reaches(np.stack([pose, goal]))[:, 0].all():
+            continue
+        observation = {"object": pose, "target": goal[:2], "joints": PARKED, "other_joints": PARKED}
+        for method, agent in agents.items():
+            action = agent.act(observation)
+            if action["grasp"]:
+                careful.reset(pose, 0)
+                came[method].append(careful.execute(0, read_cycle(action, MOTION.control_points, paper_model.arm)).refusal)
+    assert len(came["optimised"]) > 20
+    assert set(came["optimised"]) == {None}
+    assert Refusal.COLLISION in came["direct"]
+
+
+def test_a_grip_just_outside_the_annulus_is_judged_too(paper_model, careful):
+    """The cycle check lets a grip be a millimetre off."""
+    cell, base = paper_model.cell, paper_model.cell.bases[0]
+    way = np.array([math.cos(base.facing_rad + 0.3), math.sin(base.facing_rad + 0.3)])
+    edge = np.array([base.x_mm, base.y_mm]) + cell.r_max_mm * way
+    paths = cycle(paper_model, 0, edge, PLACE_MM)
+    for name, point in (("approach", -1), ("transfer", 0)):
+        paths = changed(paths, name, point, 2, min(getattr(paths, name)[point, 2] + 0.002, paper_model.arm.upper_rad[2]))
+    careful.reset(np.array([*edge, 0.0]), 0)
+    assert careful.execute(0, paths).refusal in (None, Refusal.COLLISION)
+
+
+def nearly_joined(paths, gap_rad):
+    """The same cycle with a gap before its second and third path, in the direction that keeps within the limits."""
+    transfer, retreat = paths.transfer.copy(), paths.retreat.copy()
+    transfer[0, 0] += gap_rad
+    retreat[0, 0] -= gap_rad
+    return paths._replace(transfer=transfer, retreat=retreat)
+
+
+def test_what_the_check_lets_pass_is_joined_for_those_who_are_stricter(paper_model):
+    """The timing of motions takes no gap at all."""
+    gaps = nearly_joined(good(paper_model), 0.9 * JOIN_TOLERANCE_RAD)
+    assert CycleCheck(paper_model, MOTION)(0, gaps, PARKED, START[:2], PLACE_MM) is None
+    with pytest.raises(InvalidSetting, match="gap"):
+        timed_phases(gaps, paper_model.arm, MOTION, 45.0)
+    joined = welded(gaps)
+    phases = timed_phases(joined, paper_model.arm, MOTION, 45.0)
+    np.testing.assert_array_equal(phases[-1].joints_rad[-1], PARKED)
+    np.testing.assert_array_equal(joined.approach, gaps.approach)
+    for one, other in zip(joined, gaps, strict=True):
+        np.testing.assert_array_equal(one[1:], other[1:])
+        assert abs(one[0] - other[0]).max() <= JOIN_TOLERANCE_RAD
 
 
 def test_an_object_put_elsewhere_is_found_there(paper_model):

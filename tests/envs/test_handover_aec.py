@@ -16,14 +16,15 @@ from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 from torchrl.envs.utils import check_env_specs
 
 from marl_handover.cell import build_cell, cell_config
-from marl_handover.config import MotionConfig, NoiseConfig, RewardConfig, TaskConfig
+from marl_handover.config import LoopConfig, MotionConfig, NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.envs import SupervisorEnv, handover_aec
 from marl_handover.envs.backends import KinematicBackend, Refusal
 from marl_handover.envs.top_view import GOAL
-from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice
+from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, UnknownKey
 from marl_handover.motion.cost import motion_cost
 from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.policies import load
+from marl_handover.runtime.loop import make_loop
 from marl_handover.task.rules import Outcome, Rules
 
 SUPERVISOR, LEFT, RIGHT = "supervisor", "arm_left", "arm_right"
@@ -480,6 +481,18 @@ def test_noisy_placements_within_the_tolerance_are_at_the_goal(architecture, mod
     assert missed / count == pytest.approx(math.exp(-25 / 8), abs=0.03)
 
 
+@pytest.mark.parametrize(("backend", "options"), [("kinematic", {}), ("noisy", {"missed_grasps": 0.0})])
+@pytest.mark.parametrize("checked", [False, True])
+def test_collisions_are_looked_for_if_asked(backend, options, checked, model, executors):
+    """A straight line in joint space drags the block along on the table."""
+    env = begun(model, "B", EASY, backend=backend, backend_options={**options, "check_collisions": checked})
+    command(env, executors, 0, final=1)
+    assert result(env)[3]["refusal"] == (Refusal.COLLISION if checked else None)
+    env.reset(options=EASY)
+    command(env, {LEFT: ExecutorAgent(LEFT, model)}, 0, final=1)
+    assert result(env)[3]["refusal"] is None
+
+
 class Wandering(KinematicBackend):
     """A backend of one's own: somebody moves the block by 20 mm after every transfer."""
 
@@ -525,6 +538,9 @@ def test_programming_errors_raise(model):
         ({"render_mode": "ansi"}, UnknownChoice, "render_mode"),
         ({"architecture": "C"}, UnknownChoice, "architecture"),
         ({"cell": "moon"}, UnknownChoice, "cell"),
+        ({"motion": MotionConfig(lift_mm=-5.0)}, InvalidSetting, "motion.lift_mm"),
+        ({"motion": MotionConfig(velocity_share=math.nan)}, InvalidSetting, "motion.velocity_share"),
+        ({"backend_options": {"check_collisions": "often"}}, InvalidSetting, "check_collisions"),
         ({"refused_reward": 1.0}, InvalidSetting, "refused_reward"),
         ({"refused_reward": math.nan}, InvalidSetting, "refused_reward"),
     ],
@@ -535,9 +551,34 @@ def test_bad_settings_are_named(settings, error, words, model):
 
 
 @pytest.mark.parametrize(
-    ("problem", "error"),
-    [({"state": [0.0, 0.0]}, NotFinite), ({"goal": [math.nan, 0.0, 0.0]}, NotFinite), ({"state": [500.0, 0.0, 0.0]}, OutOfReach)],
+    ("problem", "error", "says"),
+    [
+        ({"state": [0.0, 0.0]}, InvalidSetting, r"state = \[0.0, 0.0\].*three numbers"),
+        ({"goal": "somewhere"}, InvalidSetting, "goal = 'somewhere'.*three numbers"),
+        ({"goal": None}, InvalidSetting, "goal = None.*three numbers"),
+        ({"state": {"x": 1}}, InvalidSetting, "state.*three numbers"),
+        ({"start": [0.0, 0.0, 0.0]}, UnknownKey, "'start'.*state, goal"),
+        ([0.0, 0.0, 0.0], InvalidSetting, "options.*mapping"),
+        ({"goal": [math.nan, 0.0, 0.0]}, NotFinite, "goal.*finite"),
+        ({"state": [500.0, 0.0, 0.0]}, OutOfReach, "state.*reach"),
+    ],
 )
-def test_problems_that_cannot_be_are_named(problem, error, model):
-    with pytest.raises(error):
+def test_problems_that_cannot_be_are_named(problem, error, says, model):
+    with pytest.raises(error, match=says):
         begun(model, "B", problem)
+
+
+@pytest.mark.parametrize(("backend", "inset"), [("kinematic", 1.0), ("noisy", LoopConfig().chart_inset)])
+def test_hand_overs_on_inexact_arms_keep_to_the_loops_part_of_the_chart(backend, inset, model, executors):
+    """As the closed loop's own rules have it; the far corner of the chart is that much nearer to its middle."""
+    env = begun(model, "B", FAR, backend=backend)
+    assert env.rules.cell.config.chart_inset == inset
+    loop = make_loop(load("exact", model.cell), backend)
+    assert loop.rules.cell.config.chart_inset == inset
+    corner = np.array([-1.0, -1.0, 1.0, 1.0])
+    np.testing.assert_array_equal(env.rules.decode(corner).place_mm, loop.rules.decode(corner).place_mm)
+
+
+def test_a_cell_that_keeps_farther_from_its_edge_stays_so(model):
+    narrow = model._replace(cell=model.cell.with_inset(0.9))
+    assert begun(narrow, backend="noisy").rules.cell.config.chart_inset == 0.9

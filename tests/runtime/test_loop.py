@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from marl_handover import policies
-from marl_handover.config import LoopConfig, MotionConfig, NoiseConfig, TaskConfig
-from marl_handover.envs.backends import KinematicBackend, NoisyBackend
-from marl_handover.envs.cycle_check import Refusal
+from marl_handover.config import LoopConfig, MotionConfig, NoiseConfig, RewardConfig, TaskConfig
+from marl_handover.envs.backends import Execution, KinematicBackend, NoisyBackend
+from marl_handover.envs.cycle_check import END_TOLERANCE_MM, Refusal
 from marl_handover.errors import InvalidSetting, UnknownChoice
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.learning.rollout import play
+from marl_handover.motion.cost import cache_file, cost_table, settings_key
+from marl_handover.motion.planner import MotionPlanner
 from marl_handover.runtime.loop import ClosedLoop, make_loop
 from marl_handover.task.rules import Outcome, Rules
 
@@ -269,10 +271,110 @@ def test_inexact_arms_keep_away_from_the_edge_of_the_chart():
     assert make_loop(policy.under(narrow), "noisy").policy.rules.cell.config.chart_inset == 0.8
 
 
-@pytest.mark.parametrize(("name", "value"), [("transfers", 0), ("chart_inset", 1.2), ("edge_mm", -1.0), ("edge_mm", math.nan)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("transfers", 0), ("chart_inset", 1.2), ("edge_mm", -1.0), ("edge_mm", 1.01), ("edge_mm", math.nan)]
+)
 def test_settings_out_of_their_limits_are_named(name, value):
     with pytest.raises(InvalidSetting, match=rf"loop\.{name}"):
         make_loop(policies.load("exact"), "noisy", settings=LoopConfig(**{name: value}))
+
+
+def test_the_supervisor_may_be_shown_an_object_as_far_off_as_an_arm_accepts_it():
+    LoopConfig(edge_mm=END_TOLERANCE_MM).validate()
+    with pytest.raises(InvalidSetting, match=r"loop\.edge_mm"):
+        LoopConfig(edge_mm=math.nextafter(END_TOLERANCE_MM, math.inf)).validate()
+
+
+def test_fewer_transfers_than_the_task_allows_are_refused(planner):
+    for name in ("noisy", "kinematic"):
+        with pytest.raises(InvalidSetting, match=r"loop\.transfers = 5: must be at least task\.max_steps = 6"):
+            make_loop(policies.load("exact", task=TaskConfig(max_steps=6)), name, settings=LoopConfig(transfers=5))
+    with pytest.raises(InvalidSetting, match=r"loop\.transfers = 30.* 31"):
+        scripted(planner, quiet(planner.model), [[FINAL, LEFT, 0.0, 0.0]], max_steps=31)
+    assert make_loop(policies.load("exact", task=TaskConfig(max_steps=5)), "noisy", settings=LoopConfig(transfers=5)).limit == 5
+
+
+@pytest.mark.parametrize("shift_mm", [0.0, 7.0])
+def test_after_a_collision_the_arm_that_moved_the_object_was_the_last_one(planner, shift_mm):
+    """Refused either way, and judged so; but an object that was pushed all the same is one that this arm has handled."""
+
+    class Colliding(NoisyBackend):
+        def execute(self, arm, paths):
+            self.put(self._pose + [shift_mm, 0.0, 0.0])
+            return Execution(self._pose.copy(), self.joints_rad(), 0.0, Refusal.COLLISION)
+
+    backend = Colliding(planner.model, MOTION, noise=EXACT, missed_grasps=0.0)
+    loop = scripted(planner, backend, [[HAND_OVER, LEFT, 0.1, 0.0], [HAND_OVER, LEFT, 0.2, 0.0]])
+    first, second = loop.play(START, GOAL).transfers[:2]
+    assert (first.done.refusal, first.outcome) == (Refusal.COLLISION, Outcome.WRONG_POSITION)
+    assert second.previous_arm == loop.policy.seen[1][1] == (0 if shift_mm else -1)
+
+
+class Drooping(NoisyBackend):
+    """Servos that hold the arms a little off what they were told."""
+
+    droop = np.zeros((2, 5))
+
+    def joints_rad(self):
+        return super().joints_rad() + self.droop
+
+
+def at_limit(planner):
+    """A planner whose parked pose has the wrist at its limit."""
+    upper = math.degrees(planner.model.arm.upper_rad[3])
+    return MotionPlanner(planner.model, MotionConfig(parked_deg=[*MOTION.parked_deg[:3], upper, 0.0]))
+
+
+@pytest.mark.parametrize(("joint", "off_rad"), [(3, 0.008), (4, 0.008), (4, -0.008)])
+def test_an_arm_that_droops_past_a_limit_or_rolls_a_little_can_still_start(planner, joint, off_rad):
+    planner = at_limit(planner)
+    backend = Drooping(planner.model, planner.motion, noise=EXACT, missed_grasps=0.0)
+    backend.droop = np.zeros((2, 5))
+    backend.droop[0, joint] = off_rad
+    assert joint == 4 or not planner.model.arm.within_limits(backend.joints_rad()[0])
+    assert scripted(planner, backend, [[HAND_OVER, LEFT, 0.1, 0.0]]).play(START, GOAL).transfers[0].done.refusal is None
+
+
+def test_an_arm_far_past_a_limit_declines(planner):
+    planner = at_limit(planner)
+    backend = Drooping(planner.model, planner.motion, noise=EXACT, missed_grasps=0.0)
+    backend.droop = np.array([[0.0, 0.0, 0.0, 0.05, 0.0], np.zeros(5)])
+    done = scripted(planner, backend, [[HAND_OVER, LEFT, 0.1, 0.0]]).play(START, GOAL).transfers[0].done
+    assert (done.refusal, "joint limits" in done.detail) == (Refusal.DECLINED, True)
+
+
+def test_the_other_arm_is_avoided_where_it_is_measured(planner):
+    """Its roll is not taken for 0: the fingers stand as they stand."""
+    told = []
+
+    class Asked(MotionPlanner):
+        def cycle(self, arm, pick_mm, place_mm, joints_rad, other_joints_rad):
+            told.append((np.array(joints_rad), np.array(other_joints_rad)))
+            return super().cycle(arm, pick_mm, place_mm, joints_rad, other_joints_rad)
+
+    backend = Drooping(planner.model, MOTION, noise=EXACT, missed_grasps=0.0)
+    backend.droop = np.full((2, 5), 0.01)
+    measured = backend.joints_rad()
+    scripted(Asked(planner.model, MOTION), backend, [[HAND_OVER, LEFT, 0.1, 0.0]]).play(START, GOAL)
+    np.testing.assert_array_equal(told[0][1], measured[1])
+    np.testing.assert_array_equal(told[0][0], [*measured[0, :4], 0.0])
+
+
+def test_transfers_are_priced_as_these_arms_move(planner, tmp_path, monkeypatch):
+    """A table made for other motion settings, kept where the package looks for it, with prices that no real path has."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    motion, cell = MotionConfig(lift_mm=31.0), planner.model.cell
+    usual = cost_table(cell, MotionConfig())
+    table = replace(usual, key=settings_key(cell, motion), string_mm=0 * usual.string_mm + 700.0, excess_mm=0 * usual.excess_mm)
+    cache_file(table.key).parent.mkdir()
+    table.save(cache_file(table.key))
+    task = TaskConfig(reward=RewardConfig(motion_weight=0.5))
+    for name in ("kinematic", "noisy"):
+        loop = make_loop(policies.load("exact", task=task), name, motion)
+        order = loop.policy.rules.motion_penalty(np.int64(0), START, GOAL)
+        assert order == pytest.approx(0.5 * 700 / 100)
+    policy = policies.adapted("exact", motion=motion, reward=task.reward)
+    assert policy.rules.motion_penalty(np.int64(0), START, GOAL) == pytest.approx(3.5)
 
 
 def test_unknown_backends_are_named():

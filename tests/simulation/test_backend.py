@@ -9,6 +9,8 @@ from marl_handover.envs.backends import make_backend
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.simulation.backend import BulletBackend
+from marl_handover.simulation.engine import length, pybullet
+from marl_handover.simulation.world import CONTROL_S
 
 
 @pytest.fixture
@@ -62,7 +64,45 @@ def test_a_block_let_go_on_the_way_is_dropped(backend, cycle):
     opening = np.linspace(0, 12, len(phases[3].t_s))
     phases[3] = phases[3].__class__("transfer", phases[3].t_s, phases[3].joints_rad, opening)
     phases[4] = phases[4].__class__("lower", phases[4].t_s, phases[4].joints_rad, np.full(len(phases[4].t_s), 12.0))
-    assert backend.carry_out(0, tuple(phases)).refusal in (Refusal.DROPPED, Refusal.COLLISION)
+    done = backend.carry_out(0, tuple(phases))
+    assert done.refusal == Refusal.DROPPED
+    assert math.dist(done.pose[:2], (30.0, -15.0)) < math.dist(done.pose[:2], (-60.0, -5.0))  # the fingers let go early
+
+
+def test_a_cycle_that_is_nearly_joined_is_carried_out(backend, planner, motion):
+    """Within what the check lets pass; the timing takes no gap."""
+    parked = np.radians(motion.parked_deg)
+    pose = backend.reset(np.array([30.0, -15.0, 0.3]), 0)
+    paths = planner.cycle(0, pose[:2], (-70.0, 10.0), parked, parked).paths
+    for later in paths[1:]:
+        later[0, 0] += 5e-5
+    done = backend.execute(0, paths)
+    assert done.refusal is None
+    assert np.hypot(*(done.pose[:2] - (-70.0, 10.0))) < 2
+
+
+def lay_down(backend, pose, tilt_deg):
+    """The block on its side, nothing else changed."""
+    turned = pybullet.getQuaternionFromEuler([math.radians(tilt_deg), 0.0, 0.0])
+    at = [length(value) for value in (*pose[:2], 20.0)]
+    pybullet.resetBasePositionAndOrientation(backend.cell.block.body, at, turned, physicsClientId=backend.cell.engine.client)
+    backend.cell.settle()
+
+
+@pytest.mark.parametrize("fails", ["the grasp", "nothing else"])
+def test_a_block_that_lies_has_tipped_whatever_else_went_wrong(backend, cycle, fails):
+    """Beside where the fingers close, or laid down while the arm retreats."""
+    backend.reset(np.array([100.0, -120.0, 0.0]) if fails == "the grasp" else np.array([-30.0, -25.0, 0.0]), 0)
+    phases = cycle(0, (-30.0, -25.0), (60.0, -10.0))
+    if fails == "the grasp":
+        lay_down(backend, (100.0, -120.0), 90.0)
+    else:
+        end_s = phases[-1].t_s[-1]
+        calls = iter(range(int(end_s / CONTROL_S) + 2))
+        backend.on_step = lambda: lay_down(backend, (60.0, -10.0), 90.0) if next(calls) == int(end_s / CONTROL_S) - 5 else None
+    done = backend.carry_out(0, phases)
+    assert backend.last.arms[0].grasped == (fails == "nothing else")
+    assert done.refusal == Refusal.TIPPED
 
 
 def test_it_is_found_by_name(model, motion):
