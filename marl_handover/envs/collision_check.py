@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.envs.cycle_check import CycleCheck
+from marl_handover.motion.executor import ROLL_RAD
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.segment import DENSE_SAMPLES, Segment
 from marl_handover.motion.splines import sampled_basis
@@ -19,16 +20,14 @@ SHORT_MM = 0.05
 """How far a path may fall short of a clearance: planned ones keep it exactly, but commands are float32, 1e-7 rad off, and paths are joined
 where the cycle check lets them be 1e-4 rad apart, which is 0.03 mm at the end of an outstretched arm."""
 
-ROLL_RAD = 0.02
-"""The shapes are those of a hand that does not roll; a path that rolls more than this is taken for one that touches."""
-
 
 class CollisionFinder:
     """Says whether a cycle of an arm comes nearer to anything than the clearances of ``motion``.
 
     It looks at the table, the other arm where it stands, the arm itself, the standing block while the hand is empty, and the lower edges
     of the block that is carried; at the samples that planned paths are checked at. The lift-over height is no matter of touching. A block
-    that would be pushed into the table touches it, be it by less than the cycle check's millimetre.
+    that would be pushed into the table touches it, be it by less than the cycle check's millimetre. The shapes are those of a hand that
+    does not roll; a path that rolls more than :data:`ROLL_RAD` is taken for one that touches.
 
     Args:
         model: the cell.

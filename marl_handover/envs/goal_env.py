@@ -9,19 +9,15 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from marl_handover.arrays import wrap
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import TaskConfig
-from marl_handover.errors import NotFinite, OutOfReach
+from marl_handover.envs.problem_source import ProblemSource
+from marl_handover.errors import NotFinite
 from marl_handover.motion.cost import motion_cost
 from marl_handover.task.observations import observation_size, observe
-from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules
-
-PROBLEMS_PER_DRAW = 1024
 
 Observation = dict[str, NDArray[np.float32]]
 
@@ -60,21 +56,18 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         self._pose = self._goal = np.zeros(3)
         self._previous = np.int64(-1)
         self._transfers = 0
-        self._drawn: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+        self._problems = ProblemSource(self.rules.cell)
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Start an episode. ``options={"state": [x_mm, y_mm, theta_rad], "goal": [...]}`` sets the problem, else it is random.
 
         Raises:
-            OutOfReach, NotFinite: for a state or goal that cannot be.
+            UnknownKey, InvalidSetting, OutOfReach, NotFinite: for options, a state or a goal that cannot be.
         """
         super().reset(seed=seed)
         if seed is not None:
-            self._drawn.clear()
-        start, goal = self._draw()
-        options = options or {}
-        self._pose = self._checked("state", options["state"]) if "state" in options else start
-        self._goal = self._checked("goal", options["goal"]) if "goal" in options else goal
+            self._problems.clear()
+        self._pose, self._goal = self._problems.next(self.np_random, options)
         self._previous, self._transfers = np.int64(-1), 0
         return self._observation(), self._info(True, False, Outcome.NONE, 0.0)
 
@@ -143,22 +136,6 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
 
     def _flags(self, info: Any, shape: tuple[int, ...]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         return self._read(info, "final", False, shape).astype(bool), self._read(info, "feasible", True, shape).astype(bool)
-
-    def _draw(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Next random problem; drawn in blocks, since one batched draw costs as much as one single draw."""
-        if not self._drawn:
-            generator = torch.Generator().manual_seed(int(self.np_random.integers(2**62)))
-            starts, goals = sample_problems(self.rules.cell, PROBLEMS_PER_DRAW, generator)
-            self._drawn = list(zip(starts.numpy(), goals.numpy(), strict=True))
-        return self._drawn.pop()
-
-    def _checked(self, what: str, pose: Sequence[float]) -> NDArray[np.float64]:
-        array = np.asarray(pose, np.float64)
-        if array.shape != (3,) or not np.isfinite(array).all():
-            raise NotFinite(what, list(pose))
-        if not self.rules.cell.reaches(array).any():
-            raise OutOfReach(what, (float(array[0]), float(array[1])), self.rules.cell.r_min_mm, self.rules.cell.r_max_mm)
-        return np.concatenate([array[:2], np.atleast_1d(wrap(array[2]))])
 
     def _noise(self) -> NDArray[np.float64] | None:
         if not self.rules.noisy:

@@ -78,8 +78,6 @@ def test_an_approach_starts_where_the_arm_is(model):
 @pytest.mark.parametrize("method", ["direct", "optimised"])
 @pytest.mark.parametrize(("pick", "place"), [((400.0, 0.0), (200.0, 0.0)), ((200.0, 0.0), (60.0, 0.0)), ((2000.0, 0.0), (200.0, 0.0))])
 def test_what_it_cannot_reach_it_declines_and_says_so(method, pick, place, model):
-    if method == "optimised":
-        pytest.importorskip("marl_handover.motion.cycle")
     agent = ExecutorAgent("arm_left", model, method)
     action = agent.act(asked(world(model, 0, *pick), world(model, 0, *place)))
     assert (action["grasp"], action["release"]) == (0, 0)
@@ -90,7 +88,6 @@ def test_what_it_cannot_reach_it_declines_and_says_so(method, pick, place, model
 
 
 def test_optimised_cycles_have_the_same_ends(model):
-    pytest.importorskip("marl_handover.motion.cycle")
     pick, place = world(model, 0, 200.0, -0.3), world(model, 0, 190.0, 0.6)
     optimised, direct = (ExecutorAgent("arm_left", model, method).act(asked(pick, place)) for method in ("optimised", "direct"))
     assert optimised["grasp"] == optimised["release"] == 1
