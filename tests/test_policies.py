@@ -16,10 +16,10 @@ from marl_handover.compose import compose
 from marl_handover.config import TaskConfig
 from marl_handover.errors import CorruptFile, MissingFile, UnknownChoice
 from marl_handover.learning.export import policy_arrays, run_arrays, save_policy
-from marl_handover.learning.factory import make_algorithm
 from marl_handover.learning.rollout import play
 from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.learning.trainer import Trainer
+from marl_handover.learning.variants import Variant
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Outcome, Rules
 
@@ -38,7 +38,7 @@ def untrained(paper, *overrides):
     config = compose(TrainConfig, ["compile=off", *overrides], groups={"algorithm": ALGORITHMS})
     config.validate()
     torch.manual_seed(4)
-    return make_algorithm(Rules(paper, config.task), config, torch.Generator().manual_seed(0)), config
+    return Variant().algorithm(Rules(paper, config.task), config, torch.Generator().manual_seed(0)), config
 
 
 @pytest.fixture(scope="module")

@@ -32,6 +32,7 @@ class SupervisorEnv(EnvBase):
         task: the task's settings; the defaults if None.
         device: device of all tensors.
         seed: seed of problems and noise.
+        rules: another rule book than that of cell and task.
     """
 
     batch_locked = True
@@ -43,11 +44,12 @@ class SupervisorEnv(EnvBase):
         task: TaskConfig | None = None,
         device: torch.device | str = "cpu",
         seed: int | None = None,
+        rules: Rules | None = None,
     ) -> None:
         require_at_least("num_envs", num_envs, 1)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         cell, task = cell or load_cell(), task or TaskConfig()
-        self.rules = Rules(cell, task, motion_cost(cell, task))
+        self.rules = rules or Rules(cell, task, motion_cost(cell, task))
         self.generator = torch.Generator(device=self.device)
         self.epsilon_range_rad = (self.rules.epsilon_rad, self.rules.epsilon_rad)
         self._make_specs()
@@ -69,7 +71,7 @@ class SupervisorEnv(EnvBase):
             "outcome": Bounded(0, max(Outcome), shape=(count, 1), dtype=torch.int64, device=device),
         }
         self.observation_spec = Composite(problem, shape=self.batch_size, device=device)
-        self.action_spec = Bounded(-1.0, 1.0, shape=(count, 4), device=device)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(count, self.rules.action_size), device=device)
         self.reward_spec = Unbounded(shape=(count, 1), device=device)
         flag = Binary(shape=(count, 1), dtype=torch.bool, device=device)
         self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=self.batch_size, device=device)

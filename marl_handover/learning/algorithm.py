@@ -57,6 +57,14 @@ class Algorithm(ABC):
     def actor(self) -> nn.Module:
         """The network that :meth:`act` evaluates."""
 
+    def exported(self) -> list[list[nn.Linear]]:
+        """The layers of the networks that a policy file holds. Here: of the actor."""
+        return [[module for module in self.actor().modules() if isinstance(module, nn.Linear)]]
+
+    def about(self) -> dict[str, Any]:
+        """What a policy file must say besides, as JSON values."""
+        return {}
+
     def schedule(self, fraction: float) -> None:
         """Set what changes in the course of training; ``fraction`` of it is done. Here: the learning rate."""
         start = self.config.decay_from

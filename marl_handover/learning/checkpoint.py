@@ -11,8 +11,8 @@ import torch
 from marl_handover.errors import CheckpointMismatch, CorruptFile, MissingFile
 
 FILE = "checkpoint.pt"
-FORMAT = 1
-PARTS = ("config", "counters", "algorithm", "replay", "episodes", "rollout", "current", "recent", "last", "best", "losses", "random")
+FORMAT = 2
+PARTS = ("config", "counters", "algorithm", "replay", "experience", "rollout", "recent", "last", "best", "losses", "random")
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:

@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
 
 from marl_handover.cell import load_cell
 from marl_handover.errors import CorruptFile
 from marl_handover.learning.algorithm import Algorithm
 from marl_handover.learning.checkpoint import FILE, load_checkpoint
-from marl_handover.learning.factory import make_algorithm
-from marl_handover.learning.settings import ALGORITHMS, SacConfig, TrainConfig
-from marl_handover.task.rules import Rules
+from marl_handover.learning.settings import ALGORITHMS, TrainConfig
+from marl_handover.learning.variants import make_variant
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -31,22 +29,24 @@ def policy_arrays(algorithm: Algorithm, config: TrainConfig, origin: str) -> Arr
         config: its settings.
         origin: where the weights come from, such as a run directory and step.
     """
-    linear = [module for module in algorithm.actor().modules() if isinstance(module, nn.Linear)]
+    networks = algorithm.exported()
     about: dict[str, Any] = {
         "kind": algorithm.kind,
         "layout": config.algorithm.layout,
         "cell": asdict(config.cell),
         "task": asdict(config.task),
         "variant": config.variant,
-        "layers": len(linear),
+        "layers": len(networks[0]),
+        "networks": len(networks),
         "origin": origin,
+        **algorithm.about(),
     }
-    if isinstance(config.algorithm, SacConfig):
-        about |= {key: getattr(config.algorithm, key) for key in ("modes", "canonical", "harmonics")}
     arrays: Arrays = {"about": np.array(json.dumps(about))}
-    for index, layer in enumerate(linear):
-        arrays[f"weight_{index}"] = layer.weight.detach().cpu().numpy().T.astype(np.float32)
-        arrays[f"bias_{index}"] = layer.bias.detach().cpu().numpy().astype(np.float32)
+    for number, layers in enumerate(networks):
+        prefix = f"{number}/" if number else ""
+        for index, layer in enumerate(layers):
+            arrays[f"{prefix}weight_{index}"] = layer.weight.detach().cpu().numpy().T.astype(np.float32)
+            arrays[f"{prefix}bias_{index}"] = layer.bias.detach().cpu().numpy().astype(np.float32)
     return arrays
 
 
@@ -69,8 +69,8 @@ def run_arrays(folder: Path) -> Arrays:
         config = train_config(state["config"], folder / FILE)
         config.device, config.compile = "cpu", "off"
         config.task.layout = config.algorithm.layout
-        rules = Rules(load_cell(config.cell), config.task)
-        algorithm = make_algorithm(rules, config, torch.Generator())
+        variant = make_variant(config.variant)
+        algorithm = variant.algorithm(variant.rules(load_cell(config.cell), config.task, config), config, torch.Generator())
         algorithm.load_state_dict(state["algorithm"])
         step = state["counters"]["step"]
         if state["best"]:

@@ -215,6 +215,10 @@ class HybridSac(Algorithm):
         """The policy network."""
         return self.loss.actor
 
+    def about(self) -> dict[str, Any]:
+        """How the actor reads its blocks."""
+        return {key: getattr(self.config, key) for key in ("modes", "canonical", "harmonics")}
+
     def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
         """The loss module holds all networks and the temperatures."""
         return {

@@ -21,6 +21,7 @@ COLUMNS = (
     "mean_steps",
     "steps_ratio",
     "training_success_rate",
+    "training_mean_length",
     "learning_rate",
     "loss_critic",
     "loss_actor",

@@ -182,6 +182,9 @@ class PpoConfig(AlgorithmConfig):
         require_at_least("algorithm.entropy", self.entropy, 0)
 
 
+VARIANTS = ("hierarchical", "centralised", "decentralised")
+SOURCES = ("batched", "aec")
+COLLECTORS = ("local", "multiprocess", "ray")
 ALGORITHMS: dict[str, type[AlgorithmConfig]] = {"sac": SacConfig, "box_sac": BoxSacConfig, "td3": Td3Config, "ppo": PpoConfig}
 
 
@@ -194,8 +197,12 @@ class TrainConfig:
     algorithm: AlgorithmConfig = field(default_factory=SacConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     curriculum: list[StageConfig] = field(default_factory=lambda: [StageConfig(0.7, 12.0)])
-    variant: str = "hierarchical"
-    steps: int = 48_000  # environment steps, over all cells
+    variant: str = "hierarchical"  # hierarchical, centralised or decentralised
+    source: str = "batched"  # of transitions: batched (the rule book itself), or aec (the PettingZoo environment, executors and all)
+    backend: str = "kinematic"  # of source=aec: kinematic, noisy or bullet
+    collector: str = "local"  # of source=aec: local, multiprocess or ray
+    workers: int = 2  # of collector=multiprocess and ray
+    steps: int = 48_000  # commanded transfers, over all cells
     num_envs: int = 64
     seed: int = 0
     device: str = "cpu"  # cpu, cuda, cuda:N
@@ -214,14 +221,16 @@ class TrainConfig:
             raise InvalidSetting("task.layout", self.task.layout, "left alone in training; the learner's layout is algorithm.layout")
         self.task.layout = self.algorithm.layout
         self.task.validate()
-        require_choice("variant", self.variant, ("hierarchical",))
+        require_choice("variant", self.variant, VARIANTS)
+        require_choice("source", self.source, SOURCES)
+        require_choice("collector", self.collector, COLLECTORS)
         require_choice("compile", self.compile, ("auto", "on", "off"))
         require_choice("replay.hindsight.strategy", self.replay.hindsight.strategy, HINDSIGHT)
         require_between("replay.hindsight.ratio", self.replay.hindsight.ratio, 0, 1)
         require_between("replay.hindsight.near_miss_ratio", self.replay.hindsight.near_miss_ratio, 0, 1)
         require_at_least("replay.hindsight.near_miss_epsilons", self.replay.hindsight.near_miss_epsilons, 0)
         require_between("replay.hindsight.random_ratio", self.replay.hindsight.random_ratio, 0, 1)
-        for name in ("steps", "num_envs", "threads", "evaluation_interval", "evaluation_episodes", "checkpoint_interval"):
+        for name in ("steps", "num_envs", "workers", "threads", "evaluation_interval", "evaluation_episodes", "checkpoint_interval"):
             require_at_least(name, getattr(self, name), 1)
         require_at_least("replay.capacity", self.replay.capacity, self.task.max_steps * self.num_envs)
         require_at_least("curriculum (number of stages)", len(self.curriculum), 1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,18 +14,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from marl_handover.cell import load_cell
 from marl_handover.compose import to_yaml
-from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.errors import CheckpointMismatch, CorruptFile, InvalidSetting
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
 from marl_handover.learning.curriculum import Curriculum
-from marl_handover.learning.factory import make_algorithm
+from marl_handover.learning.experience import Collected
 from marl_handover.learning.recorder import Recorder, write_whole
-from marl_handover.learning.replay import EpisodeWriter, HindsightReplayBuffer
-from marl_handover.learning.rollout import play
 from marl_handover.learning.settings import OffPolicyConfig, PpoConfig, TrainConfig
-from marl_handover.task.observations import observe
+from marl_handover.learning.variants import make_variant
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome
@@ -56,28 +53,29 @@ class Trainer:
     Args:
         config: validated settings.
         folder: the run directory, made if it is not there.
+        on_evaluation: called with the row of ``metrics.csv`` after each validation; what it raises ends the run, which stays resumable.
     """
 
-    def __init__(self, config: TrainConfig, folder: Path) -> None:
+    def __init__(self, config: TrainConfig, folder: Path, on_evaluation: Callable[[dict[str, float]], object] = lambda row: None) -> None:
         config.validate()
-        self.config, self.folder = config, folder
+        self.config, self.folder, self.on_evaluation = config, folder, on_evaluation
         self.device = usable_device(config.device)
         torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
-        self.env = SupervisorEnv(config.num_envs, load_cell(config.cell), config.task, self.device, seed=config.seed + 1)
+        self.variant = make_variant(config.variant)
+        self.env = self.variant.env(config, self.device)
         self.rules = self.env.rules
-        self.algorithm = make_algorithm(self.rules, config, self.generator)
+        self.algorithm = self.variant.algorithm(self.rules, config, self.generator)
         self.curriculum = Curriculum(config.curriculum, self.env)
         self.counters = Counters(next_evaluation=config.evaluation_interval, next_checkpoint=config.checkpoint_interval)
-        self.replay = HindsightReplayBuffer(self.rules, config.replay, self.env, self.generator)
-        self.writer = EpisodeWriter(config.num_envs, config.task.max_steps, self.device)
+        self.replay = self.variant.replay(self.env, config, self.generator)
+        self.experience = self.variant.experience(self.env, config)
         self.rollout: list[TensorDictBase] = []
-        self.recent = torch.zeros(2)  # finished and solved episodes since the last evaluation
+        self.recent = torch.zeros(3)  # finished and solved episodes, and their transfers, since the last evaluation
         self.losses: dict[str, Tensor] = {}
         self.last: dict[str, float] = {}
         self.best: dict[str, Any] = {}  # the actor that did best on the validation problems of the last stage, its score and step
-        self.current: TensorDictBase | None = None
 
     def run(self) -> dict[str, Any]:
         """Train to the end; return (and write) the summary. An interrupted run continues from its last checkpoint."""
@@ -85,9 +83,7 @@ class Trainer:
         write_whole(self.folder / "config.yaml", to_yaml(self.config))
         recorder = Recorder(self.folder, self.config.steps, self.counters.step, self.config.progress)
         started = time.perf_counter() - self.counters.wall_s
-        if self.current is None:
-            self.curriculum.enter(self.counters.stage)
-            self.current = self.env.reset()
+        self.curriculum.enter(self.counters.stage)
         try:
             while self.counters.step < self.config.steps:
                 self._advance()
@@ -95,36 +91,33 @@ class Trainer:
                 self._report(recorder)
         finally:
             recorder.close()
+            self.experience.close()
         self.save()
         return self._summarise()
 
     def _advance(self) -> None:
-        """One environment step of every cell, and the gradient steps that are due."""
+        """Collect, and make the gradient steps that are due."""
         config = self.config.algorithm
-        assert self.current is not None
         blind = isinstance(config, OffPolicyConfig) and self.counters.step < config.learning_starts
-        observation = self.current["observation"]
-        if blind:
-            action = torch.rand(len(observation), 4, generator=self.generator, device=self.device) * 2 - 1
-        else:
-            action = self.algorithm.explore(observation)
-        self.current["action"] = action
-        transition, self.current = self.env.step_and_maybe_reset(self.current)
-        self.counters.step += self.config.num_envs
-        done = transition["next", "done"]
-        solved = (transition["next", "outcome"] == int(Outcome.SUCCESS)) & done
-        self.recent += torch.stack([done.sum(), solved.sum()]).cpu()
-        self.counters.episodes += int(done.sum())
-        self.algorithm.schedule(self.counters.step / self.config.steps)
+        collected = self.experience.collect(self._blind if blind else self.algorithm.explore)
+        self.counters.step += collected.steps
+        self.recent += collected.ended
+        self.counters.episodes += int(collected.ended[0])
+        self.algorithm.schedule(min(1.0, self.counters.step / self.config.steps))
         if isinstance(config, OffPolicyConfig):
-            self._learn_from_replay(transition, config)
+            self._learn_from_replay(collected, config)
         elif isinstance(config, PpoConfig):
-            self._learn_from_rollout(transition, config)
+            assert collected.transition is not None
+            self._learn_from_rollout(collected.transition, config)
 
-    def _learn_from_replay(self, transition: TensorDictBase, config: OffPolicyConfig) -> None:
-        finished = self.writer.add(transition)
-        if finished is not None:
-            self.replay.extend(finished)
+    def _blind(self, observation: Tensor) -> Tensor:
+        """Uniform actions."""
+        shape = (len(observation), self.rules.action_size)
+        return torch.rand(shape, generator=self.generator, device=self.device) * 2 - 1
+
+    def _learn_from_replay(self, collected: Collected, config: OffPolicyConfig) -> None:
+        if collected.rows is not None:
+            self.replay.extend(collected.rows)
         due = int((self.counters.step - config.learning_starts) / config.steps_per_update) - self.counters.gradient_step
         if due <= 0 or len(self.replay) < config.batch_size:
             return
@@ -151,9 +144,11 @@ class Trainer:
             counters.next_evaluation += self.config.evaluation_interval
             self.last = self.evaluate()
             self._keep_best()
-            recorder.record(self._row())
+            row = self._row()
+            recorder.record(row)
             self.recent.zero_()
             self._advance_curriculum()
+            self.on_evaluation(row)
         shown = {"success": f"{100 * self.last['success_rate']:.2f}%"} if self.last else {}
         recorder.progress(counters.step, **shown, epsilon=self.curriculum.label)
         if counters.step >= counters.next_checkpoint:
@@ -178,7 +173,7 @@ class Trainer:
 
     def _row(self) -> dict[str, float]:
         counters, (low, high) = self.counters, self.env.epsilon_range_rad
-        finished, solved = self.recent.tolist()
+        finished, solved, transfers = self.recent.tolist()
         rate = next(part.param_groups[0]["lr"] for part in self.algorithm.modules().values() if isinstance(part, torch.optim.Optimizer))
         return {
             "step": counters.step,
@@ -188,6 +183,7 @@ class Trainer:
             "epsilon_low_deg": math.degrees(low),
             "epsilon_high_deg": math.degrees(high),
             "training_success_rate": solved / finished if finished else math.nan,
+            "training_mean_length": transfers / finished if finished else math.nan,
             "learning_rate": rate,
             **self.last,
             **{name: float(value) for name, value in self.losses.items()},
@@ -197,12 +193,7 @@ class Trainer:
         """Success rate, mean steps and ratio to the optimum of the deterministic policy on the run's own validation problems."""
         generator = torch.Generator(device=self.device).manual_seed(VALIDATION_SEED + self.config.seed)
         start, goal = sample_problems(self.rules.cell, self.config.evaluation_episodes, generator, torch.float32)
-        layout, epsilon = self.rules.config.layout, self.rules.epsilon_rad
-
-        def act(pose: Tensor, goal: Tensor, previous: Tensor) -> Tensor:
-            return self.algorithm.act(observe(self.rules, layout, pose, goal, previous, epsilon))
-
-        episodes = play(self.rules, act, start, goal)
+        episodes = self.variant.play(self.algorithm, start, goal)
         solved = episodes.outcome == int(Outcome.SUCCESS)
         optimum = ExactPlanner(self.rules).plan(start.double(), goal.double()).transfers
         ratio = (episodes.transfers / optimum)[solved & (optimum > 0)]
@@ -234,16 +225,14 @@ class Trainer:
                 "counters": asdict(self.counters),
                 "algorithm": self.algorithm.state_dict(),
                 "replay": {"rows": rows, "cursor": self.replay._writer._cursor},
-                "episodes": self.writer.state_dict(),
+                "experience": self.experience.state_dict(),
                 "rollout": [step.to_dict() for step in self.rollout],
-                "current": None if self.current is None else self.current.to_dict(),
                 "recent": self.recent,
                 "last": self.last,
                 "best": self.best,
                 "losses": self.losses,
                 "random": {
                     "learner": self.generator.get_state(),
-                    "problems": self.env.generator.get_state(),
                     "torch": torch.get_rng_state(),
                 },
             },
@@ -264,19 +253,15 @@ class Trainer:
             raise CheckpointMismatch(self.folder, "architecture", _architecture(stored), self.config.task.architecture)
         self.counters = Counters(**state["counters"])
         self.algorithm.load_state_dict(state["algorithm"])
-        self.writer.load_state_dict(state["episodes"])
+        self.experience.load_state_dict(state["experience"])
         if state["replay"]["rows"] is not None:
             rows = TensorDict.from_dict(state["replay"]["rows"], auto_batch_size=True, batch_dims=1)
             self.replay.extend(rows)
             self.replay._writer._cursor = state["replay"]["cursor"]
         self.rollout = [TensorDict.from_dict(step, auto_batch_size=True, batch_dims=1) for step in state["rollout"]]
-        self.curriculum.enter(self.counters.stage)
-        if state["current"] is not None:
-            self.current = TensorDict(state["current"], self.env.batch_size, device=self.device)
         self.recent, self.last = state["recent"], state["last"]
         self.best, self.losses = state["best"], state["losses"]
         self.generator.set_state(state["random"]["learner"].cpu())
-        self.env.generator.set_state(state["random"]["problems"].cpu())
         torch.set_rng_state(state["random"]["torch"].cpu())
 
 

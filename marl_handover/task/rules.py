@@ -115,6 +115,8 @@ class Rules:
         self.noisy = config.noise.position_mm > 0 or config.noise.yaw_deg > 0
         self.measured = self.noisy or physical
 
+    action_size = 4  # numbers in an action
+
     @property
     def external_finish(self) -> bool:
         """Architecture A: the final transfer is found by kinematics, not by the policy."""

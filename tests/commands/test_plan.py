@@ -139,12 +139,12 @@ def policy_file(tmp_path_factory):
     from marl_handover.cell import cell_config, load_cell
     from marl_handover.config import TaskConfig
     from marl_handover.learning.export import policy_arrays, save_policy
-    from marl_handover.learning.factory import make_algorithm
     from marl_handover.learning.settings import TrainConfig
+    from marl_handover.learning.variants import Variant
     from marl_handover.task.rules import Rules
 
     config = TrainConfig(cell=cell_config("al5a"), task=TaskConfig(architecture="A", epsilon_deg=7.0), compile="off")
-    algorithm = make_algorithm(Rules(load_cell(config.cell), config.task), config, torch.Generator().manual_seed(0))
+    algorithm = Variant().algorithm(Rules(load_cell(config.cell), config.task), config, torch.Generator().manual_seed(0))
     path = tmp_path_factory.mktemp("policy") / "a.npz"
     save_policy(path, policy_arrays(algorithm, config, "a test"))
     return path

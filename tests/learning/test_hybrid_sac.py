@@ -7,9 +7,9 @@ from copy import deepcopy
 import pytest
 import torch
 
-from marl_handover.learning.factory import make_algorithm
 from marl_handover.learning.hybrid_sac import HybridSac, chosen_action, squashed_sample, unpacked
 from marl_handover.learning.networks import arm_blocks
+from marl_handover.learning.variants import Variant
 from marl_handover.task.observations import observe
 
 
@@ -22,7 +22,7 @@ def replay(replay_of, request):
 def learner(replay, small) -> HybridSac:
     torch.manual_seed(1)
     config = small("sac", "algorithm.modes=2", "algorithm.candidates=4")
-    return make_algorithm(replay.rules, config, torch.Generator().manual_seed(2))
+    return Variant().algorithm(replay.rules, config, torch.Generator().manual_seed(2))
 
 
 @pytest.fixture

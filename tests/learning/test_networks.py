@@ -10,9 +10,9 @@ from torch.nn import functional as F
 from torchrl.modules import TanhNormal
 
 from marl_handover.cell.symmetry import GROUP
-from marl_handover.learning.factory import make_algorithm
 from marl_handover.learning.hybrid_sac import squashed_sample
 from marl_handover.learning.networks import Branches, Harmonics, HybridActor, TwinMLP, arm_blocks
+from marl_handover.learning.variants import Variant
 from marl_handover.task.observations import ARM_FIELDS, observe
 
 
@@ -61,7 +61,7 @@ def test_actor_that_does_not_fold_is_not_equivariant_along_the_base_line(paper, 
 @pytest.mark.parametrize("symmetry", GROUP)
 def test_critic_is_invariant(cell, rules_of, draw, small, symmetry):
     rules = rules_of(cell)
-    critic = make_algorithm(rules, small("sac", "algorithm.canonical=true"), torch.Generator()).loss.critic.double()
+    critic = Variant().algorithm(rules, small("sac", "algorithm.canonical=true"), torch.Generator()).loss.critic.double()
     problem = problems(draw, cell)
     plain, mirrored = (arm_blocks(seen(rules, *problem, element)) for element in (GROUP[0], symmetry))
     if symmetry.mirror_y:

@@ -1,0 +1,90 @@
+"""Formulations of the problem, by name: what each brings to training.
+
+``hierarchical``: a supervisor decides, executors carry out. The others are what it is compared with.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from marl_handover.cell import Cell, load_cell
+from marl_handover.config import TaskConfig
+from marl_handover.envs.supervisor_env import SupervisorEnv
+from marl_handover.errors import InvalidSetting, UnknownChoice
+from marl_handover.learning.algorithm import Algorithm
+from marl_handover.learning.box import BoxSac, Td3
+from marl_handover.learning.experience import BatchedExperience, Experience
+from marl_handover.learning.hybrid_sac import HybridSac
+from marl_handover.learning.ppo import Ppo
+from marl_handover.learning.replay import HindsightReplayBuffer
+from marl_handover.learning.rollout import Episodes, play
+from marl_handover.learning.settings import ALGORITHMS, VARIANTS, OffPolicyConfig, TrainConfig
+from marl_handover.task.observations import observe
+from marl_handover.task.rules import Rules
+
+
+class Variant:
+    """The hierarchical formulation, and the base of the others."""
+
+    algorithms: ClassVar[dict[str, type[Algorithm]]] = {"sac": HybridSac, "box_sac": BoxSac, "td3": Td3, "ppo": Ppo}
+
+    def rules(self, cell: Cell, task: TaskConfig, config: TrainConfig) -> Rules:
+        """The rule book that actions are judged by; prices of motions are the environment's matter."""
+        return Rules(cell, task)
+
+    def env(self, config: TrainConfig, device: torch.device) -> SupervisorEnv:
+        """The batch of cells to train in."""
+        return SupervisorEnv(config.num_envs, load_cell(config.cell), config.task, device, seed=config.seed + 1)
+
+    def experience(self, env: SupervisorEnv, config: TrainConfig) -> Experience:
+        """Where transitions come from."""
+        return BatchedExperience(env, isinstance(config.algorithm, OffPolicyConfig))
+
+    def replay(self, env: SupervisorEnv, config: TrainConfig, generator: torch.Generator) -> HindsightReplayBuffer:
+        """The memory that off-policy learners draw from."""
+        return HindsightReplayBuffer(env.rules, config.replay, env, generator)
+
+    def algorithm(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> Algorithm:
+        """The learner that ``config`` names.
+
+        Raises:
+            UnknownChoice: no such algorithm, or not in this variant.
+            InvalidSetting: the hybrid one with a layout that has no block an arm.
+        """
+        name = config.algorithm.name
+        if name not in ALGORITHMS:
+            raise UnknownChoice("algorithm", name, ALGORITHMS)
+        if name not in self.algorithms:
+            raise UnknownChoice(f"algorithm of variant={config.variant}", name, self.algorithms)
+        if name == "sac" and config.algorithm.layout != "relative":
+            raise InvalidSetting("algorithm.layout", config.algorithm.layout, "'relative' for algorithm=sac; box_sac takes any layout")
+        return self.algorithms[name](rules, config, generator)
+
+    def play(self, algorithm: Algorithm, start: Tensor, goal: Tensor) -> Episodes:
+        """Episodes of the deterministic policy on problems (n, 3), (n, 3), for validation."""
+        rules = algorithm.rules
+        layout, epsilon = rules.config.layout, rules.epsilon_rad
+
+        def act(pose: Tensor, goal: Tensor, previous: Tensor) -> Tensor:
+            return algorithm.act(observe(rules, layout, pose, goal, previous, epsilon))
+
+        return play(rules, act, start, goal)
+
+
+def make_variant(name: str) -> Variant:
+    """The formulation of that name. Modules of the others are imported when they are asked for.
+
+    Raises:
+        UnknownChoice: no such variant.
+    """
+    if name not in VARIANTS:
+        raise UnknownChoice("variant", name, VARIANTS)
+    if name == "hierarchical":
+        return Variant()
+    module = importlib.import_module(f"marl_handover.learning.{name}")
+    variant: Variant = getattr(module, name.capitalize())()
+    return variant

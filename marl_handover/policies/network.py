@@ -1,0 +1,82 @@
+"""Trained supervisors, evaluated in numpy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover.arrays import select
+from marl_handover.policies.files import network_layers
+from marl_handover.policies.policy import Floats, SupervisorPolicy
+from marl_handover.task.observations import ARM_FIELDS, ODD_FIELDS, observe
+from marl_handover.task.rules import Rules
+
+
+class NetworkPolicy(SupervisorPolicy):
+    """A trained actor, evaluated in numpy.
+
+    Args:
+        rules: the rule book to act under.
+        name: what it was loaded as.
+        arrays: weights, from a policy file.
+        about: what the file says of them.
+    """
+
+    def __init__(self, rules: Rules, name: str, arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> None:
+        super().__init__(rules, name)
+        self.about = dict(about)
+        self.variant = about["variant"]
+        self.layers = network_layers(arrays, about)
+        self.hybrid = about["kind"] == "hybrid"
+        self.odd = np.array([-1.0 if field in ODD_FIELDS else 1.0 for field in ARM_FIELDS], np.float32)
+        self.beta_sign = np.array([base.mirror for base in rules.cell.bases], np.float32)
+        self.sines = [ARM_FIELDS.index(field) for field in ("sin_hand_over", "sin_finish_error")]
+        self.angles = [ARM_FIELDS.index(field) for field in ("cos_finish_error", "cos_hand_over")]
+
+    def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        """The likeliest branch and its mean place."""
+        observation = observe(self.rules, self.about["layout"], pose, goal, previous_arm).astype(np.float32)
+        return self._hybrid(observation) if self.hybrid else np.tanh(self._forward(observation)[..., :4])
+
+    def _forward(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        for weight, bias in self.layers[:-1]:
+            x = np.maximum(x @ weight + bias, 0)
+        weight, bias = self.layers[-1]
+        return x @ weight + bias
+
+    def _hybrid(self, observation: NDArray[np.float32]) -> Floats:
+        modes = self.about["modes"]
+        blocks = observation.reshape(*observation.shape[:-1], -1, len(ARM_FIELDS))
+        sign = self._sign(blocks)
+        turned = np.where(sign[..., None] < 0, blocks * self.odd, blocks)
+        out = self._forward(self._harmonics(turned))
+        logits = out[..., : 1 + modes]
+        if self.rules.external_finish:
+            logits[..., 0] = -math.inf
+        flat = logits.reshape(*logits.shape[:-2], -1)
+        branch = flat.argmax(-1)
+        arm, choice = np.divmod(branch, 1 + modes)
+        mean = np.tanh(out[..., 1 + modes : 1 + 3 * modes]).reshape(*out.shape[:-2], -1, 2)
+        index = arm * modes + np.maximum(choice - 1, 0)
+        place = np.take_along_axis(mean, np.asarray(index)[..., None, None], -2)[..., 0, :]
+        final, right = np.where(choice == 0, 1.0, -1.0), 2.0 * arm - 1.0
+        return np.stack([final, right, place[..., 0] * select(sign, arm), place[..., 1] * self.beta_sign[arm]], -1)
+
+    def _sign(self, blocks: NDArray[np.float32]) -> NDArray[np.float32]:
+        if not self.about["canonical"]:
+            return np.ones_like(blocks[..., 0])
+        hand_over, finish = (blocks[..., index] for index in self.sines)
+        return np.where(np.where(hand_over == 0, finish, hand_over) < 0, np.float32(-1), np.float32(1))
+
+    def _harmonics(self, blocks: NDArray[np.float32]) -> NDArray[np.float32]:
+        parts = [blocks]
+        for index in self.angles:
+            cosine, sine = blocks[..., index], blocks[..., index + 1]
+            for _ in range(self.about["harmonics"]):
+                cosine, sine = cosine * cosine - sine * sine, 2 * sine * cosine
+                parts.append(np.stack([cosine, sine], -1))
+        return np.concatenate(parts, -1)

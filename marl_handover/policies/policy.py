@@ -1,0 +1,51 @@
+"""What a supervisor policy answers. Nothing here needs torch.
+
+A policy answers two calls: ``policy(observation)`` takes one observation of the AEC supervisor (``state``, ``goal``,
+``previous_arm`` 0 none, 1 L, 2 R) and returns its action (``final``, ``arm``, ``place``); ``policy.act(pose, goal,
+previous_arm)`` takes batches (n, 3), (n, 3), (n,) (-1 none, 0 L, 1 R), or single problems (3,), (3,), (), and returns
+actions (n, 4) or (4,).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from copy import copy
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover.task.rules import Rules
+
+Floats = NDArray[np.float64]
+
+
+class SupervisorPolicy(ABC):
+    """A supervisor of one cell.
+
+    Attributes:
+        rules: the rule book it acts under; ``rules.epsilon_rad`` is the accuracy it aims at.
+        name: what it was loaded as.
+    """
+
+    variant = "hierarchical"
+
+    def __init__(self, rules: Rules, name: str) -> None:
+        self.rules, self.name = rules, name
+
+    @abstractmethod
+    def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        """Actions: final, arm, alpha, beta."""
+
+    def under(self, rules: Rules) -> SupervisorPolicy:
+        """The same policy acting under another rule book, with another epsilon for instance."""
+        other = copy(self)
+        other.rules = rules
+        return other
+
+    def __call__(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        """The AEC supervisor's action for its observation."""
+        pose, goal = np.asarray(observation["state"], float), np.asarray(observation["goal"], float)
+        action = self.act(pose, goal, np.asarray(observation["previous_arm"]) - 1)
+        return {"final": int(action[0] > 0), "arm": int(action[1] > 0), "place": np.asarray(action[2:], np.float32)}

@@ -1,0 +1,98 @@
+"""Policies by name."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from marl_handover.cell import Cell, load_cell
+from marl_handover.config import CellConfig, MotionConfig, TaskConfig
+from marl_handover.errors import CheckpointMismatch, MissingFile, UnknownChoice
+from marl_handover.motion.cost import motion_cost
+from marl_handover.policies.baselines import ExactPolicy, GreedyPolicy, RandomPolicy
+from marl_handover.policies.files import KINDS, read_policy, stored_settings
+from marl_handover.policies.network import NetworkPolicy
+from marl_handover.policies.policy import SupervisorPolicy
+from marl_handover.resources import package_path
+from marl_handover.task.rules import Rules
+
+NAMES = ("exact", "random", "greedy", "pretrained_a", "pretrained_b")
+
+
+def load(
+    name: str, cell: Cell | None = None, task: TaskConfig | None = None, seed: int = 0, *, motion: MotionConfig | None = None
+) -> SupervisorPolicy:
+    """A policy by name: ``exact``, ``random``, ``greedy``, ``pretrained_a``, ``pretrained_b``, a run directory or a policy file (``.npz``).
+
+    Args:
+        name: see above.
+        cell: the cell; the trained policy's own, or the shipped ``paper`` cell, if None.
+        task: the task; the trained policy's own, or the defaults, if None.
+        seed: of ``random``.
+        motion: how the arms move whose ways are priced; the defaults if None.
+
+    Raises:
+        UnknownChoice, MissingFile, CorruptFile, CheckpointMismatch: if there is no such policy or its file is not whole.
+    """
+    if name in ("exact", "random", "greedy"):
+        rules = _rules(cell or load_cell(), task or TaskConfig(), motion)
+        made = {"exact": ExactPolicy, "greedy": GreedyPolicy}
+        return RandomPolicy(rules, seed) if name == "random" else made[name](rules)
+    arrays = _arrays(name)
+    about = json.loads(str(arrays["about"]))
+    own_cell, own_task = stored_settings(about)
+    rules = _rules(cell or load_cell(own_cell), task or own_task, motion, about)
+    module, _, kind = KINDS[about["kind"]].partition(":")
+    policy: SupervisorPolicy = getattr(importlib.import_module(module), kind)(rules, name, arrays, about)
+    return policy
+
+
+def adapted(
+    name: str, cell: CellConfig | None = None, seed: int = 0, *, motion: MotionConfig | None = None, **changes: Any
+) -> SupervisorPolicy:
+    """A policy by name under its own cell and task, except where the caller says otherwise.
+
+    Args:
+        name: as in :func:`load`.
+        cell: settings of another cell.
+        seed: of ``random``.
+        motion: as in :func:`load`.
+        changes: task settings put over the policy's own; None leaves one as it is.
+
+    Raises:
+        CheckpointMismatch: ``architecture`` is asked for and the policy was trained for the other one.
+    """
+    own = load(name, seed=seed, motion=motion)
+    settings = replace(own.rules.config, **{key: value for key, value in changes.items() if value is not None})
+    settings.validate()
+    trained = own.rules.config.architecture
+    if isinstance(own, NetworkPolicy) and settings.architecture != trained:
+        raise CheckpointMismatch(name, "architecture", trained, settings.architecture)
+    about = own.about if isinstance(own, NetworkPolicy) else {}
+    return own.under(_rules(own.rules.cell if cell is None else load_cell(cell), settings, motion, about))
+
+
+def _rules(cell: Cell, task: TaskConfig, motion: MotionConfig | None, about: Mapping[str, Any] | None = None) -> Rules:
+    """The rule book that training used too; ``about`` is what a policy file says of itself."""
+    return Rules(cell, task, motion_cost(cell, task, motion))
+
+
+def _arrays(name: str) -> Mapping[str, NDArray[Any]]:
+    if name in NAMES:
+        return read_policy(package_path(f"pretrained/{name.removeprefix('pretrained_')}.npz"))
+    path = Path(name)
+    if path.is_dir():
+        from marl_handover.learning.export import run_arrays
+
+        return run_arrays(path)
+    if path.suffix == ".npz":
+        return read_policy(path)
+    if path.exists() or path.parent != Path():
+        raise MissingFile("run directory or policy file", path, f"or choose one of: {', '.join(NAMES)}")
+    raise UnknownChoice("policy", name, (*NAMES, "a run directory", "a policy file (.npz)"))
