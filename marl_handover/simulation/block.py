@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from marl_handover.config import BlockConfig
-from marl_handover.simulation.engine import Engine, Floats, Surface, inertia, length, pybullet, tilt_of, to_mm, yaw_of
+from marl_handover.simulation.engine import Engine, Floats, Surface, inertia, length, pybullet, tilt_of, to_mm
 
 _BEAD_SPACING_MM = 6.0
 _WOOD_KG_MM3 = 650e-9
@@ -87,11 +87,18 @@ class Block:
         )
         pybullet.resetBaseVelocity(self.body, [0, 0, 0], [0, 0, 0], physicsClientId=self._client)
 
+    def transform(self) -> Floats:
+        """T_world_block (4, 4) in mm, wherever it is, upright or not."""
+        at, quaternion = pybullet.getBasePositionAndOrientation(self.body, physicsClientId=self._client)
+        T = np.eye(4)
+        T[:3, :3] = np.reshape(pybullet.getMatrixFromQuaternion(quaternion), (3, 3))
+        T[:3, 3] = to_mm(at) - self._centre_mm * T[:3, 2]
+        return T
+
     def pose(self) -> Floats:
         """Where the middle of the lower face is, and the yaw: (3,) mm, mm, rad."""
-        at, quaternion = pybullet.getBasePositionAndOrientation(self.body, physicsClientId=self._client)
-        x_mm, y_mm, _ = to_mm(at) - self._centre_mm * np.reshape(pybullet.getMatrixFromQuaternion(quaternion), (3, 3))[:, 2]
-        return np.array([x_mm, y_mm, yaw_of(quaternion)])
+        T = self.transform()
+        return np.array([T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])])
 
     def height_mm(self) -> float:
         """Height of the middle of the lower face above the table."""

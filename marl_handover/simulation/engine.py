@@ -209,12 +209,6 @@ def inertia(kg_mm2: float) -> float:
     return kg_mm2 * 1e-6 * SCALE**2
 
 
-def yaw_of(quaternion: Iterable[float]) -> float:
-    """World yaw of a body's x axis."""
-    rotation = pybullet.getMatrixFromQuaternion(list(quaternion))
-    return math.atan2(rotation[3], rotation[0])
-
-
 def tilt_of(quaternion: Iterable[float]) -> float:
     """Angle between a body's z axis and the vertical."""
     rotation = pybullet.getMatrixFromQuaternion(list(quaternion))

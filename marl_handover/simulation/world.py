@@ -146,8 +146,12 @@ class BulletCell:
             for finger in self.arms[arm].fingers
         )
 
-    def collisions(self) -> dict[str, Touch]:
-        """The deepest touch of each two that must not touch: arms, an arm and the table (its base apart), a held block and another arm."""
+    def collisions(self, holding: set[int] | None = None) -> dict[str, Touch]:
+        """The deepest touch of each two that must not touch: arms, an arm and the table (its base apart), a held block and another arm.
+
+        ``holding``: the arms that hold the block; those of the run that is going on if None.
+        """
+        holding = self._holding if holding is None else holding
         found: dict[str, Touch] = {}
         for index, arm in enumerate(self.arms):
             self._note(
@@ -155,7 +159,7 @@ class BulletCell:
             )
             for other in range(index):
                 self._note(found, f"arm {other} - arm {index}", self.engine.touches(arm.body, self.arms[other].body))
-            carrier = next((other for other in range(len(self.arms)) if other != index and other in self._holding), None)
+            carrier = next((other for other in range(len(self.arms)) if other != index and other in holding), None)
             if carrier is not None:
                 self._note(found, f"block - arm {index}", self.engine.touches(arm.body, self.block.body))
         return found

@@ -1,0 +1,180 @@
+"""What stands in the cell, as shapes for the renderer: block and pin, the goal's marker, arms, printed sheets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from marl_handover.cell.build import CellModel
+from marl_handover.cell.cell import Base
+from marl_handover.cell.kinematics import ArmModel, transform
+from marl_handover.cell.urdf import Primitive
+from marl_handover.config import BlockConfig
+from marl_handover.perception.boards import Sheet, block_top, marker_sheet
+from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels, flat_pose
+from marl_handover.perception.renderer import Colour, Renderer, Shape
+from marl_handover.perception.settings import LookConfig, TargetConfig
+
+_WHITE = (248.0, 248.0, 248.0)
+_WOOD, _PIN = (107.0, 153.0, 194.0), (148.0, 199.0, 224.0)
+_LINKS: dict[str, Colour] = {"base_link": (33, 31, 31), "wrist": (33, 31, 31), "hand": (33, 31, 31)}
+_FINGER, _SILVER = (33.0, 184.0, 237.0), (199.0, 194.0, 191.0)
+_LIGHT = np.array([0.4, -0.3, 1.0]) / math.sqrt(0.4**2 + 0.3**2 + 1)
+_PIN_PIECES = 5
+_ROUND = 12
+
+
+def sheet_shape(sheet: Sheet, T_world_sheet: Floats, window: str = "sheet") -> Shape:
+    """A printed sheet; ``T_world_sheet`` (4, 4) as in :class:`Sheet`, in mm."""
+    x, y = sheet.width_mm / 2, sheet.height_mm / 2
+    return Shape(_moved(T_world_sheet, [[-x, y, 0], [x, y, 0], [x, -y, 0], [-x, -y, 0]]), _WHITE, sheet.pixels, window)
+
+
+def block_shapes(block: BlockConfig, T_world_block: Floats, eye_mm: Floats, top: Sheet | Colour, sides: Colour = _WOOD) -> list[Shape]:
+    """The block with its pin, seen from ``eye_mm`` (3,).
+
+    ``T_world_block`` (4, 4) in mm: origin in the middle of the lower face, z along the pin; it may be carried, or lie on its side.
+    ``top``: the sheet on its upper face, or a colour.
+    """
+    half, high = block.side_mm / 2, block.height_mm
+    corners = np.array([[-half, half], [half, half], [half, -half], [-half, -half]])
+    upper, lower = (np.column_stack([corners, np.full(4, z)]) for z in (high, 0.0))
+    faces = [lower, *(np.array([lower[i], lower[i - 1], upper[i - 1], upper[i]]) for i in range(4))]
+    shapes, centre = [], _moved(T_world_block, [[0, 0, high / 2]])[0]
+    for face in faces:
+        points = _moved(T_world_block, face)
+        outwards = points.mean(axis=0) - centre
+        normal = outwards / np.linalg.norm(outwards)
+        if normal @ (eye_mm - points[0]) > 0:
+            shapes.append(Shape(points, _shaded(sides, normal), window="block"))
+    if T_world_block[:3, 2] @ (eye_mm - _moved(T_world_block, upper[:1])[0]) > 0:
+        points = _moved(T_world_block, upper)
+        shapes.append(Shape(points, _WHITE, top.pixels, "block") if isinstance(top, Sheet) else Shape(points, top, window="block"))
+    heights = np.linspace(high, block.pin_top_mm, _PIN_PIECES + 1)
+    ring = _ring(block.pin_diameter_mm / 2)
+    for low, up in pairwise(heights):
+        piece = np.concatenate([np.column_stack([ring, np.full(_ROUND, z)]) for z in (low, up)])
+        shapes.append(Shape(_moved(T_world_block, piece), _PIN, window="block"))
+    return shapes
+
+
+def arm_shapes(arm: ArmModel, base: Base, joints_rad: ArrayLike, gripper_mm: float | None = None) -> list[Shape]:
+    """An arm, as its URDF's collision shapes, at joints (5,); ``gripper_mm``: how far each finger is from closed, None: open."""
+    T_world_base = flat_pose(base.x_mm, base.y_mm, base.facing_rad)
+    frames = arm.link_transforms(np.asarray(joints_rad, dtype=float), gripper_mm)
+    shapes = []
+    for link in arm.description.links:
+        colour = _FINGER if "finger" in link.name else _LINKS.get(link.name, _SILVER)
+        for primitive in link.collisions:
+            T = T_world_base @ frames[link.name] @ transform(primitive.xyz_mm, primitive.rpy_rad)
+            shapes.append(Shape(_moved(T, _outline(primitive)), colour))
+    return shapes
+
+
+class CellPainter:
+    """The camera of a twin: the picture of a cell from the truth about it.
+
+    Args:
+        model: the cell.
+        calibration: the camera as it truly hangs; never show it to what has to calibrate.
+        target: which markers are on block and goal.
+        look: blur, noise and light.
+        seed: of the noise.
+        background: BGR picture of the empty table; None: plain.
+    """
+
+    def __init__(
+        self,
+        model: CellModel,
+        calibration: CameraCalibration,
+        target: TargetConfig | None = None,
+        look: LookConfig | None = None,
+        seed: int = 0,
+        background: Pixels | None = None,
+    ) -> None:
+        target = target or TargetConfig()
+        target.validate()
+        self.model, self.target = model, target
+        self.renderer = Renderer(calibration, look, seed, background)
+        self._eye = calibration.eye_mm()
+        self._block = model.cell.config.block
+        self._top = block_top(self._block, target)
+        self._goal = marker_sheet(target.dictionary, target.goal_id, target.goal_mm, target.goal_mm * 4 / 3)
+
+    def picture(
+        self,
+        T_world_block: Floats | None,
+        joints_rad: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+        gripper_mm: Sequence[float | None] | None = None,
+        sheets: Sequence[tuple[Sheet, Floats]] = (),
+    ) -> Pixels:
+        """BGR (height, width, 3).
+
+        Args:
+            T_world_block: (4, 4) in mm, see :func:`block_shapes`; None: there is no block.
+            joints_rad: (num_arms, 5); None: no arms.
+            goal: (3,) where the printed goal lies, x_mm, y_mm, theta_rad; None: there is none.
+            gripper_mm: per arm, how far each finger is from closed; None: open.
+            sheets: further printed sheets, each with its T_world_sheet.
+        """
+        shapes = [sheet_shape(sheet, T, f"sheet {index}") for index, (sheet, T) in enumerate(sheets)]
+        if goal is not None:
+            x_mm, y_mm, theta_rad = (float(value) for value in np.asarray(goal))
+            shapes.append(sheet_shape(self._goal, flat_pose(x_mm, y_mm, theta_rad, self.target.goal_height_mm), "goal"))
+        if T_world_block is not None:
+            shapes += block_shapes(self._block, np.asarray(T_world_block), self._eye, self._top)
+        if joints_rad is not None:
+            grippers = gripper_mm or [None] * self.model.cell.num_arms
+            for base, joints, opened in zip(self.model.cell.bases, np.asarray(joints_rad), grippers, strict=True):
+                shapes += arm_shapes(self.model.arm, base, joints, opened)
+        return self.renderer.picture(shapes)
+
+
+def held_boards(calibration: CameraCalibration, count: int, seed: int = 0) -> list[Floats]:
+    """T_world_sheet (4, 4) each of a board that somebody holds before the camera: near and far, slanted, all over the picture."""
+    random, T_camera_world = np.random.default_rng(seed), calibration.pose()
+    width, height = calibration.intrinsics.size_px
+    wide, high = np.array([width, height]) / 2 / calibration.intrinsics.matrix[0, 0]
+    poses = []
+    for _ in range(count):
+        depth = random.uniform(0.45, 0.75) * T_camera_world[2, 3]
+        place = random.uniform(-0.5, 0.5, 2) * (wide, high) * depth
+        slant = transform((0.0, 0.0, 0.0), (math.pi + random.uniform(-0.6, 0.6), random.uniform(-0.6, 0.6), random.uniform(-0.4, 0.4)))
+        T_camera_sheet = transform((*place, depth), (0.0, 0.0, 0.0)) @ slant
+        poses.append(np.linalg.inv(T_camera_world) @ T_camera_sheet)
+    return poses
+
+
+def _moved(T: Floats, points: ArrayLike) -> Floats:
+    points = np.asarray(points, dtype=float)
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def _shaded(colour: Colour, normal: Floats) -> Colour:
+    """A face's colour in the light, of which a face that looks away still gets some."""
+    gain = 0.45 + 0.55 * max(0.0, float(normal @ _LIGHT))
+    return colour[0] * gain, colour[1] * gain, colour[2] * gain
+
+
+def _ring(radius_mm: float) -> Floats:
+    angle = np.arange(_ROUND) * (2 * math.pi / _ROUND)
+    return radius_mm * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _outline(shape: Primitive) -> Floats:
+    """Points (n, 3) whose convex hull is the shape, in its own frame; round ones from twelve sides."""
+    if shape.kind == "box":
+        signs = np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, -1).T
+        return np.asarray(signs * np.asarray(shape.size_mm) / 2)
+    if shape.kind == "cylinder":
+        radius, length = shape.size_mm
+        ring = _ring(radius)
+        return np.concatenate([np.column_stack([ring, np.full(_ROUND, side * length / 2)]) for side in (-1, 1)])
+    radius = shape.size_mm[0]
+    rings = [np.column_stack([_ring(radius * math.cos(a)), np.full(_ROUND, radius * math.sin(a))]) for a in np.linspace(-1.2, 1.2, 7)]
+    return np.concatenate(rings)
