@@ -34,7 +34,10 @@ COMMANDS: dict[str, Command] = {
     "plan": Command("solve one problem: the sequence, its cost and every intermediate pose", "marl_handover.commands.plan"),
     "train": Command("train a supervisor into a run directory", "marl_handover.commands.train"),
     "evaluate": Command("play episodes with a policy: table, JSON, trace", "marl_handover.commands.evaluate"),
+    "compare": Command("a suite of runs over seeds: statistics, tables, figures", "marl_handover.commands.compare"),
+    "tune": Command("search for better settings of training, as an Optuna study", "marl_handover.commands.tune"),
     "simulate": Command("play episodes in the PyBullet cell: text, MP4 or GIF", "marl_handover.commands.simulate"),
+    "emulate": Command("a servo controller on a pseudo-terminal, with faults if wanted", "marl_handover.commands.emulate"),
     "plot": Command("a figure of a run, a trace or a cell", "marl_handover.commands.plot"),
 }
 

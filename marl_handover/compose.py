@@ -5,7 +5,8 @@ From weak to strong, whatever the order typed:
 
 1. the dataclass defaults,
 2. the chosen options: a dataclass registered in code (``algorithm=td3``) or a YAML file (``cell=al5a``, ``cell=my/cell.yaml``),
-3. the preset (``preset=paper_b``): differences over the whole tree, which may choose options itself,
+3. the preset (``preset=paper_b``): differences over the whole tree, which may choose options itself (a schema with a field ``preset`` of
+   its own has none: there, the word is that field),
 4. single values (``task.epsilon_deg=3``).
 
 Nothing global is touched: no run directory, no logging, no registered config.
@@ -155,7 +156,8 @@ class _Composer:
         choices: dict[Keys, _Choice] = {}
         preset: dict[str, Any] = {}
         file = None
-        preset_name = next((a.choice for a in reversed(arguments) if a.keys == ("preset",)), None)
+        own = "preset" in self.tree.names(())  # then the word is a setting of the schema like any other
+        preset_name = None if own else next((a.choice for a in reversed(arguments) if a.keys == ("preset",)), None)
         if preset_name:
             file = option_file("preset", preset_name, self.configs / "preset", None)
             preset = load_mapping(file, "preset")
@@ -163,7 +165,7 @@ class _Composer:
             self._take_choices(preset, (), choices, file)
         values = []
         for argument in arguments:
-            if argument.keys == ("preset",):
+            if argument.keys == ("preset",) and not own:
                 continue
             chosen = argument.keys[:-1] if argument.keys[-1] == "name" and argument.keys[:-1] in self.groups else argument.keys
             if argument.choice is None or not self._is_section(chosen):
@@ -177,8 +179,6 @@ class _Composer:
         self.assign_tree((), preset, file)
         for argument in values:
             self._assign(argument.keys, self._read(argument), argument.text, None)
-        if preset_name and "preset" in self.tree.names(()):
-            self._assign(("preset",), preset_name, f"preset={preset_name}", None)
         return self.finish()
 
     def finish(self) -> Any:

@@ -49,7 +49,7 @@ def keys_help(schema: type, aliases: Mapping[str, str] | None = None, groups: Gr
     short = {long: alias for alias, long in (aliases or {}).items()}
     rows = list(_rows(schema, "", groups or {}, configs))
     presets = option_names(configs / "preset")
-    if presets:
+    if presets and "preset" not in {field.name for field in fields(schema)}:
         rows.append(_Row("preset", " | ".join(presets), "", "named differences over all keys; or a YAML file"))
     rows = [row._replace(key=f"{short[row.key]} = {row.key}" if row.key in short else row.key) for row in rows]
     widths = [max(len(row[column]) for row in rows) for column in range(3)]

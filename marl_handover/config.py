@@ -6,7 +6,7 @@ Lengths are in mm, angles in the unit of the name's suffix.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from marl_handover.errors import InvalidSetting, UnknownChoice
@@ -14,6 +14,9 @@ from marl_handover.errors import InvalidSetting, UnknownChoice
 ARCHITECTURES = ("A", "B")
 LAYOUTS = ("raw", "relative", "object")
 MOTION_METHODS = ("optimised", "paper")
+EXPLORATIONS = ("chart", "area")
+LEARNERS = ("independent", "shared", "ctde")
+CENTRALISED_MOTIONS = ("flat", "offset")
 HINDSIGHT = ("none", "final", "future", "episode")
 
 
@@ -67,10 +70,21 @@ class RewardConfig:
 
 @dataclass
 class NoiseConfig:
-    """Execution noise of every placement: standard deviations per axis."""
+    """Noise of the batched rules, standard deviations per axis: of every placement, and of where the supervisor sees the object."""
 
     position_mm: float = 0.0
     yaw_deg: float = 0.0
+    observed_mm: float = 0.0  # the supervisor sees the object displaced by so much; what is done and judged is the truth
+    observed_deg: float = 0.0
+
+    @property
+    def observed(self) -> bool:
+        """Whether the supervisor sees anything but the truth."""
+        return self.observed_mm > 0 or self.observed_deg > 0
+
+    def report(self) -> dict[str, float]:
+        """For results: the noise of placements, and that of observations where there is any."""
+        return {name: value for name, value in asdict(self).items() if self.observed or not name.startswith("observed")}
 
 
 @dataclass
@@ -82,6 +96,7 @@ class TaskConfig:
     max_steps: int = 20
     symmetry_order: int = 1  # k: the block looks the same when turned by 360/k degrees
     layout: str = "relative"
+    previous_arm: bool = True  # whether observations say which arm moved last
     position_tolerance_mm: float = 5.0  # "at the goal" after a noisy final placement
     reward: RewardConfig = field(default_factory=RewardConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
@@ -94,8 +109,8 @@ class TaskConfig:
         require_positive("position_tolerance_mm", self.position_tolerance_mm)
         require_at_least("max_steps", self.max_steps, 1)
         require_at_least("symmetry_order", self.symmetry_order, 1)
-        require_at_least("noise.position_mm", self.noise.position_mm, 0)
-        require_at_least("noise.yaw_deg", self.noise.yaw_deg, 0)
+        for name, value in asdict(self.noise).items():
+            require_at_least(f"noise.{name}", value, 0)
         require_at_least("reward.motion_weight", self.reward.motion_weight, 0)
         for name in ("success", "step", "failure"):
             require_between(f"reward.{name}", getattr(self.reward, name), -1e6, 1e6)
@@ -141,6 +156,34 @@ class MotionConfig:
         angles = self.parked_deg
         if len(angles) != 5 or not all(math.isfinite(angle) for angle in angles) or angles[4] != 0:
             raise InvalidSetting("motion.parked_deg", angles, "five finite angles in degrees, the last one, of the wrist roll, 0")
+
+
+@dataclass
+class CentralisedConfig:
+    """The motions that a centralised policy makes itself: the paper's splines, their inner control points given by numbers."""
+
+    motion: str = "offset"  # flat: a number is a joint value within its limits; offset: it is added to the executors' straight first guess
+    offset_rad: float = 1.2  # of motion=offset: what a number of 1 adds; 0.5 does not reach the drawn-in postures of wide turns
+    control_points: int = 7  # N = m + d - 1 with the paper's (m, d) = (3, 5)
+    degree: int = 5
+    samples: int = 33  # of a path, at which it is judged
+    refusal_hidden: list[int] = field(default_factory=lambda: [128, 128])  # of algorithm=sac: of the network that foresees refusals
+    motion_temperature: float = 0.01  # of algorithm=sac: to start with
+    motion_entropy_start: float = -2.0  # of algorithm=sac: target entropy of each number, falling from start ...
+    motion_entropy_end: float = -3.5  # ... to end, as that of places does
+
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
+        require_choice("centralised.motion", self.motion, CENTRALISED_MOTIONS)
+        require_between("centralised.offset_rad", self.offset_rad, 0.01, math.pi)
+        require_between("centralised.degree", self.degree, 1, 7)
+        require_between("centralised.control_points", self.control_points, self.degree + 1, 25)
+        require_between("centralised.samples", self.samples, 9, 1001)
+        require_positive("centralised.motion_temperature", self.motion_temperature)
+        for width in self.refusal_hidden:
+            require_at_least("centralised.refusal_hidden", width, 1)
+        for name in ("motion_entropy_start", "motion_entropy_end"):
+            require_between(f"centralised.{name}", getattr(self, name), -10, 0.69)
 
 
 @dataclass
@@ -204,3 +247,37 @@ class LoopConfig:
             raise InvalidSetting("loop.transfers", self.transfers, f"at least task.max_steps = {max_steps}")
         require_between("loop.chart_inset", self.chart_inset, 0.1, 1)
         require_between("loop.edge_mm", self.edge_mm, 0, 1)  # an arm refuses to close its fingers farther than that from the pin
+
+
+@dataclass
+class DecentralisedConfig:
+    """variant=decentralised: two arms that take turns, without a supervisor.
+
+    A pass earns half of what a transfer does. To pass for ever then earns -10 at the usual discount, less than any solution, so it does not
+    pay; and as the discount counts decisions, a pass costs about half a transfer, so that waiting for the arm that can finish, or that had
+    better begin, is cheaper than a transfer too many.
+    """
+
+    learners: str = "ctde"  # independent (nothing shared), shared (one learner for both), ctde (shared actor, centralised critic)
+    pass_reward: float = -0.5
+    eager: float = 0.25  # share of exploration's decisions in which an arm that reaches the object does not pass
+    decisions_per_transfer: int = 3  # an episode has at most so many times task.max_steps decisions, passes included
+
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
+        require_choice("decentralised.learners", self.learners, LEARNERS)
+        require_between("decentralised.pass_reward", self.pass_reward, -1e6, 0)
+        require_between("decentralised.eager", self.eager, 0, 1)
+        require_at_least("decentralised.decisions_per_transfer", self.decisions_per_transfer, 1)
+
+    def validate_task(self, task: TaskConfig) -> None:
+        """As :meth:`validate`; raise :class:`InvalidSetting` also on architecture A, where nobody decides to finish."""
+        self.validate()
+        if task.architecture != "B":
+            raise InvalidSetting("architecture", task.architecture, "B with variant=decentralised, where finishing is a decision")
+
+
+def changed(name: str, settings: LoopConfig | MotionConfig) -> list[tuple[str, Any]]:
+    """Key and value of every setting of group ``name`` that is not the default."""
+    usual = asdict(type(settings)())
+    return [(f"{name}.{key}", value) for key, value in asdict(settings).items() if value != usual[key]]

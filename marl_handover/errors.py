@@ -121,3 +121,11 @@ class CheckpointMismatch(HandoverError):
     def __init__(self, path: Path | str, key: str, stored: Any, wanted: Any) -> None:
         super().__init__(f"checkpoint {path} has {key} = {stored!r}, but {wanted!r} was asked for")
         self.path, self.key, self.stored, self.wanted = Path(path), key, stored, wanted
+
+
+class MissingExtra(HandoverError):
+    """A setting needs a package that is not installed."""
+
+    def __init__(self, setting: str, package: str, extra: str) -> None:
+        super().__init__(f"{setting} needs the package {package}; run: pip install 'marl_handover[{extra}]'")
+        self.setting, self.package, self.extra = setting, package, extra

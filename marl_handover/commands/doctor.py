@@ -32,8 +32,19 @@ CORE = (
     "pillow",
     "imageio",
     "imageio-ffmpeg",
+    "joblib",
+    "optuna",
+    "opencv-python-headless",
+    "pyserial",
 )
-EXTRAS = {"peers": ("stable-baselines3",), "ompl": ("ompl",), "dev": ("pytest", "ruff", "mypy", "import-linter", "toppra")}
+EXTRAS = {
+    "compare": ("rliable", "pandas"),
+    "ray": ("ray",),
+    "realsense": ("pyrealsense2",),
+    "peers": ("stable-baselines3",),
+    "ompl": ("ompl",),
+    "dev": ("pytest", "ruff", "mypy", "import-linter", "toppra"),
+}
 
 
 @dataclass
@@ -77,7 +88,7 @@ def _installed(package: str) -> str | None:
 
 def _packages(packages: tuple[str, ...]) -> Iterator[str]:
     for package in packages:
-        yield f"{package:<14} {_installed(package) or 'MISSING'}"
+        yield f"{package:<23} {_installed(package) or 'MISSING'}"
 
 
 def _system() -> Iterator[str]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from marl_handover.arrays import wrap
 from marl_handover.cell import NO_ARM
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.config import CellConfig, LoopConfig, MotionConfig, NoiseConfig, require_seed
+from marl_handover.config import CellConfig, MotionConfig, NoiseConfig, changed, require_seed
 from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, WorkFailed
 from marl_handover.policies import SupervisorPolicy, adapted
 from marl_handover.task.planner import ExactPlanner
@@ -133,12 +133,6 @@ def _planner(config: PlanConfig, rules: Rules) -> MotionPlanner | None:
         raise InvalidSetting(f"arm_{error.name}", error.value, error.limit) from error
     except UnknownChoice as error:
         raise UnknownChoice(f"arm_{error.name}", error.value, error.choices) from error
-
-
-def changed(name: str, settings: LoopConfig | MotionConfig) -> list[tuple[str, Any]]:
-    """Key and value of every setting of group ``name`` that is not the default."""
-    usual = asdict(type(settings)())
-    return [(f"{name}.{key}", value) for key, value in asdict(settings).items() if value != usual[key]]
 
 
 def solve(policy: SupervisorPolicy, start: Floats, goal: Floats) -> dict[str, Any]:

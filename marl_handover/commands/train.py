@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from marl_handover.errors import CheckpointMismatch, InvalidSetting, MissingFile
-from marl_handover.learning.settings import ALGORITHMS, TrainConfig
+from marl_handover.learning.algorithm_settings import ALGORITHMS
+from marl_handover.learning.settings import TrainConfig
 
 if TYPE_CHECKING:
     from marl_handover.learning.trainer import Trainer

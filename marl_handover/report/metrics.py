@@ -17,7 +17,15 @@ Metrics = Mapping[str, Floats]
 """Column name -> values (n,), NaN where a row has none."""
 
 NEEDED = ("step", "success_rate")
-OPTIONAL = ("gradient_step", "steps_ratio", "epsilon_low_deg", "epsilon_high_deg")
+OPTIONAL = (
+    "gradient_step",
+    "mean_steps",
+    "steps_ratio",
+    "epsilon_low_deg",
+    "epsilon_high_deg",
+    "training_success_rate",
+    "training_mean_length",
+)
 
 
 def read_metrics(run: Path) -> Metrics:

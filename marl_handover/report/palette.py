@@ -29,3 +29,13 @@ def arm_colour(index: int) -> str:
 def arm_line(index: int) -> str:
     """Line style of an arm; further arms start over."""
     return ARM_LINES[index % len(ARM_LINES)]
+
+
+SERIES = ("#4477AA", "#EE6677", "#228833", "#CCBB44", "#66CCEE", "#AA3377", "#555555")
+SERIES_LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)))
+"""Paul Tol's bright colours for many curves in one picture, and the line styles that go with them; 35 differ."""
+
+
+def series_style(index: int) -> dict[str, object]:
+    """Colour and line style of the curve of that index: no two neighbours share either."""
+    return {"color": SERIES[index % len(SERIES)], "linestyle": SERIES_LINES[index % len(SERIES_LINES)]}

@@ -16,7 +16,8 @@ from marl_handover.cli import main
 from marl_handover.compose import compose
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.learning import evaluation
-from marl_handover.learning.settings import ALGORITHMS, TrainConfig
+from marl_handover.learning.algorithm_settings import ALGORITHMS
+from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.trainer import Trainer
 from marl_handover.motion.cost import cache_file, cost_table, settings_key
 from marl_handover.task.rules import Rules

@@ -12,8 +12,8 @@ import yaml
 from marl_handover.cli import main
 from marl_handover.commands.train import SCHEMA
 from marl_handover.compose import compose
+from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.recorder import COLUMNS
-from marl_handover.learning.settings import ALGORITHMS
 from marl_handover.policies import load
 
 TINY = (
@@ -96,7 +96,7 @@ def test_a_run_is_not_overwritten(finished, capsys):
     ("argument", "words"),
     [
         ("stepz=5", ("stepz", "steps")),
-        ("algorithm=dqn", ("dqn", "sac", "ppo")),
+        ("algorithm=a3c", ("a3c", "sac", "ppo")),
         ("architecture=C", ("A, B",)),
         ("variant=flat", ("hierarchical",)),
         ("device=gpu9", ("device", "cpu")),

@@ -1,0 +1,118 @@
+"""``marl-handover tune``: search for better settings of training."""
+
+from __future__ import annotations
+
+import sys
+from copy import deepcopy
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from marl_handover.commands import train
+from marl_handover.config import require_at_least, require_choice
+from marl_handover.errors import InvalidSetting
+from marl_handover.learning.settings import TrainConfig
+from marl_handover.resources import resource_path
+
+if TYPE_CHECKING:
+    from optuna.study import Study
+
+    from marl_handover.compare.tune import Note, Search
+
+
+@dataclass
+class TuneConfig(TrainConfig):
+    """Settings of ``tune``: those of the trials' training, which the search starts from, and its own."""
+
+    search: str = ""  # ranges to search in: a name or a YAML file; the algorithm's own if empty
+    fixed: list[str] = field(default_factory=list)  # keys of the search space that are left as they are
+    trials: int = 20  # that the study has in the end; a call does those that are left
+    study: str = ""  # its name in the storage; the algorithm's if empty
+    storage: str = ""  # postgresql://user:password@host/name, sqlite:///file or a journal file's path; <out>/study.journal if empty
+    pruner: str = "median"  # what ends hopeless trials: median, hyperband or none
+    launcher: str = "loky"  # loky: the cores of this machine; ray: a cluster
+    address: str = ""  # of the Ray cluster: auto, host:port or local
+    jobs: int = 0  # trials at the same time; 0: one a core
+    steps: int = 16_000  # of each trial
+    evaluation_interval: int = 2_000  # environment steps; after each, a trial may be ended
+    evaluation_episodes: int = 1_000
+    checkpoint_interval: int = 16_000  # environment steps
+
+
+SCHEMA = TuneConfig
+ALIASES = train.ALIASES
+GROUPS = train.GROUPS
+
+
+def run(config: TuneConfig) -> int:
+    """Do the trials that are left; write ``trials.csv`` and ``best.yaml``; print the best settings."""
+    from marl_handover.compare.tune import prepare, run_trials
+
+    search, out = _search(config)
+    study, left = prepare(search)
+    if config.progress:
+        print(f"study {search.study}: {search.trials - left} of {search.trials} trials are done", file=sys.stderr)
+    notes: list[Note] = []
+    options: dict[str, Any] = {"launcher": config.launcher, "address": config.address, "jobs": config.jobs, "progress": config.progress}
+    for note in run_trials(search, study, left, **options):
+        notes.append(note)
+        if config.progress or note.error:
+            tqdm.write(_line(note), file=sys.stderr)
+    _report(search, study, out, notes)
+    return 0
+
+
+def _search(config: TuneConfig) -> tuple[Search, Path]:
+    """What to do, checked, and the folder for it."""
+    from marl_handover.compare.launch import LAUNCHERS
+    from marl_handover.compare.tune import PRUNERS, Search
+    from marl_handover.compare.tune_space import load_space
+    from marl_handover.compare.tune_storage import located
+    from marl_handover.compose_schema import option_file
+
+    require_choice("pruner", config.pruner, PRUNERS)
+    require_choice("launcher", config.launcher, LAUNCHERS)
+    require_at_least("trials", config.trials, 1)
+    require_at_least("jobs", config.jobs, 0)
+    if config.resume:
+        raise InvalidSetting("resume", config.resume, "left empty; a study continues by itself")
+    settings = TrainConfig(**{item.name: getattr(config, item.name) for item in fields(TrainConfig)})
+    deepcopy(settings).validate()  # which fills in what follows from the rest, and a trial may change that
+    name = config.study or config.algorithm.name
+    out = Path(config.out or f"runs/tune/{name}")
+    if out.exists() and not out.is_dir():
+        raise InvalidSetting("out", str(out), "a folder; this is a file")
+    origin = option_file("search", config.search or config.algorithm.name, resource_path("configs") / "search", None)
+    space = load_space(origin, settings, config.fixed)
+    storage = located(config.storage, out)
+    search = Search(name, storage, settings, space, origin, (out / "trials").absolute(), config.trials, config.seed, config.pruner)
+    return search, out
+
+
+def _line(note: Note) -> str:
+    score = "" if note.value is None else f" with score {note.value:.4f}"
+    return f"trial {note.number}: {note.state.lower()}{score}{note.error and ': ' + note.error}"
+
+
+def _report(search: Search, study: Study, out: Path, notes: list[Note]) -> None:
+    """Write what is known of the trials, and the best of them."""
+    from marl_handover.compare.tune import require_result
+    from marl_handover.compare.tune_report import arguments, best_settings, write_preset, write_trials
+
+    out.mkdir(parents=True, exist_ok=True)
+    write_trials(study, search, out / "trials.csv")
+    require_result(study, notes)
+    settings = best_settings(study, search)
+    write_preset(settings, study, out / "best.yaml")
+    best = study.best_trial
+    print(f"best of {len(study.trials)} trials: {best.number}, score {best.value:.4f}, {_measured(best.user_attrs)}")
+    print(f"marl-handover train {' '.join(arguments(settings))}")
+    print(f"the same: marl-handover train preset={out / 'best.yaml'}; all trials: {out / 'trials.csv'}")
+
+
+def _measured(about: dict[str, Any]) -> str:
+    ratio = about.get("steps_ratio")
+    times = f", {ratio:.3f} times the fewest transfers" if ratio is not None else ""
+    return f"success {100 * about['success_rate']:.2f} %{times} on its validation problems"

@@ -1,0 +1,93 @@
+"""What is written down of a run: its settings, by which a changed one is told, and where and by what it was made."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from marl_handover.learning.recorder import write_whole
+from marl_handover.learning.settings import TrainConfig
+from marl_handover.resources import package_path
+from marl_handover.runtime.assessment import AssessmentConfig
+
+PLACES = ("out", "resume", "progress", "policy")
+"""Settings that say where something is, not what it is."""
+
+Settings = dict[str, Any]
+
+
+def settings_of(config: TrainConfig | AssessmentConfig) -> Settings:
+    """All settings by dotted key, as JSON has them, without those that only say where things are."""
+    flat = _flat(json.loads(json.dumps(asdict(config))))
+    return {key: value for key, value in flat.items() if key not in PLACES}
+
+
+def fingerprint(settings: Settings) -> str:
+    """Short hash of settings."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> Settings:
+    flat: Settings = {}
+    for key, value in tree.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+def usual_settings(config: TrainConfig | AssessmentConfig) -> Settings:
+    """What :func:`settings_of` gives if nobody says otherwise; with the same algorithm."""
+    usual = type(config)()
+    if isinstance(config, TrainConfig) and isinstance(usual, TrainConfig):
+        usual.algorithm = type(config.algorithm)()
+    return settings_of(usual)
+
+
+def read_record(path: Path) -> dict[str, Any] | None:
+    """A JSON file of a task's folder; None if it is not there or not whole (records are written as a whole, so then nobody finished it)."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def write_record(path: Path, content: Mapping[str, Any]) -> None:
+    """Write such a file as a whole."""
+    write_whole(path, json.dumps(content, indent=1) + "\n")
+
+
+def machine() -> dict[str, Any]:
+    """What numbers were made on."""
+    import torch
+
+    model = platform.processor()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model)
+    except OSError:
+        pass
+    return {"cpu": model, "cores": os.cpu_count(), "platform": platform.platform(), "torch": torch.__version__}
+
+
+def commit() -> str:
+    """Short name of the commit this package is a checkout of, with ``+`` if files differ from it; ``none`` if it is installed."""
+    package = package_path("")
+    if not (package.parent / ".git").exists():
+        return "none"
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", "-C", str(package.parent), *arguments], capture_output=True, text=True, check=False)
+        return done.stdout.strip()
+
+    try:
+        name = git("rev-parse", "--short", "HEAD")
+        return name + ("+" if git("status", "--porcelain") else "") if name else "none"
+    except OSError:
+        return "none"

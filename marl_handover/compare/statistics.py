@@ -1,0 +1,160 @@
+"""Statistics over seeds, with rliable: interquartile means and their bootstrap intervals, profiles, improvement, what a level cost.
+
+Scores are arrays (runs, tasks) or (runs, tasks, points); runs are the seeds of a row, tasks what they were judged on. Intervals are the
+2.5th and 97.5th percentile of :data:`REPETITIONS` stratified bootstrap samples over the runs (Agarwal et al., "Deep reinforcement
+learning at the edge of the statistical precipice", 2021), the same ones at every call. One run has no interval.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover.errors import MissingExtra
+
+Floats = NDArray[np.float64]
+
+REPETITIONS = 2000
+COVERAGE = 0.95
+BOOTSTRAP_SEED = 0
+LEVELS = (0.90, 0.95, 0.99)
+"""Success rates whose cost in transfers is told."""
+
+
+class Interval(NamedTuple):
+    """An estimate and its 95 % interval, whose ends are None where one run is all there is."""
+
+    value: float
+    low: float | None
+    high: float | None
+
+
+class Band(NamedTuple):
+    """An estimate at each of n points, with the ends of its interval: three arrays (n,). One run's ends are its values."""
+
+    value: Floats
+    low: Floats
+    high: Floats
+
+
+class Milestone(NamedTuple):
+    """What a level cost: the median over all runs, those that never got there counted as infinite, which is None here.
+
+    ``reached`` of ``runs`` got there.
+    """
+
+    median: float | None
+    low: float | None
+    high: float | None
+    reached: int
+    runs: int
+
+
+def require_statistics() -> Any:
+    """The package rliable. Raises :class:`MissingExtra` with the line that installs it."""
+    try:
+        from rliable import library
+    except ImportError as error:
+        raise MissingExtra("compare", "rliable", "compare") from error
+    return library
+
+
+def interquartile_mean(scores: Floats) -> Floats:
+    """Mean of the middle half of all scores, over runs and tasks, at each point: (runs, tasks, n) -> (n,)."""
+    # What scipy's trim_mean does, which rliable calls, without its overhead: a bootstrap calls this thousands of times.
+    ordered = np.sort(scores.reshape(-1, scores.shape[-1]), 0)
+    cut = len(ordered) // 4
+    return np.asarray(ordered[cut : len(ordered) - cut].mean(0))
+
+
+def mean(scores: Floats) -> Floats:
+    """Plain mean over runs and tasks: (runs, tasks, n) -> (n,)."""
+    return np.asarray(scores.mean((0, 1)))
+
+
+def summarised(scores: Floats, estimator: Callable[[Floats], Floats] = interquartile_mean) -> list[Interval]:
+    """An estimate of each of n measures of scores (runs, tasks, n)."""
+    band = band_of(scores, estimator)
+    known = len(scores) > 1
+    return [Interval(value, low if known else None, high if known else None) for value, low, high in np.stack(band).T.tolist()]
+
+
+def band_of(scores: Floats, estimator: Callable[[Floats], Floats] = interquartile_mean) -> Band:
+    """An estimate at each of n points of scores (runs, tasks, n), or, by other estimators, (runs, tasks)."""
+    library = require_statistics()
+    value = estimator(scores)
+    if len(scores) == 1:
+        return Band(value, value, value)
+    with _repeatable():
+        _, intervals = library.get_interval_estimates({"": scores}, estimator, reps=REPETITIONS, confidence_interval_size=COVERAGE)
+    return Band(value, *intervals[""])
+
+
+def profile(scores: Floats, thresholds: Floats) -> Band:
+    """Performance profile of scores (runs, tasks): at each threshold the share of them that lies above it."""
+    return band_of(scores, lambda drawn: (drawn[..., None] > thresholds).mean((0, 1)))
+
+
+def improvement(ours: Floats, theirs: Floats) -> Interval:
+    """Probability that a run of ``ours`` (runs, tasks) beats one of ``theirs`` on the same task; a tie counts half."""
+    library = require_statistics()
+
+    def probability(first: Floats, second: Floats) -> Floats:
+        ahead = first[:, None] - second[None]
+        return np.array([((ahead > 0) + 0.5 * (ahead == 0)).mean()])
+
+    value = float(probability(ours, theirs)[0])
+    if min(len(ours), len(theirs)) == 1:
+        return Interval(value, None, None)
+    with _repeatable():
+        _, intervals = library.get_interval_estimates(
+            {"": [ours, theirs]}, probability, reps=REPETITIONS, confidence_interval_size=COVERAGE
+        )
+    return Interval(value, float(intervals[""][0, 0]), float(intervals[""][1, 0]))
+
+
+def milestone(costs: Sequence[float | None]) -> Milestone:
+    """What a level cost; None for a run that never got there, which stays in the count.
+
+    The bootstrap here takes order statistics, never a value between two, as one of them may be infinite.
+    """
+    values = np.array([math.inf if cost is None else cost for cost in costs])
+    reached = int(np.isfinite(values).sum())
+    if len(values) == 1:
+        return Milestone(_finite(values[0]), None, None, reached, 1)
+    drawn = np.random.default_rng(BOOTSTRAP_SEED).choice(values, (REPETITIONS, len(values)))
+    medians = np.sort(_median(drawn))
+    tail = (1 - COVERAGE) / 2
+    low, high = medians[math.floor(tail * REPETITIONS)], medians[math.ceil((1 - tail) * REPETITIONS) - 1]
+    return Milestone(_finite(_median(values)), _finite(low), _finite(high), reached, len(values))
+
+
+def first_reaching(steps: Floats, values: Floats, level: float) -> float | None:
+    """The first of ``steps`` (n,) at which ``values`` (n,) are at or above ``level``; None if none is."""
+    hits = np.flatnonzero(values >= level - 1e-9)
+    return float(steps[hits[0]]) if len(hits) else None
+
+
+def _median(values: Floats) -> Any:
+    """The middle value along the last axis, the upper one of an even number: a cost that half of the runs keep to."""
+    return np.sort(values, -1)[..., values.shape[-1] // 2]
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+@contextmanager
+def _repeatable() -> Iterator[None]:
+    """The random state that rliable 1.2 takes has no effect, it draws from numpy's global one: seed that, and give it back as it was."""
+    state = np.random.get_state()  # noqa: NPY002
+    np.random.seed(BOOTSTRAP_SEED)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(state)  # noqa: NPY002

@@ -1,0 +1,281 @@
+"""A suite: one YAML file that says which rows are trained, how they are evaluated, and which tables and figures come of it.
+
+A row is one line: arguments of ``train``, or the name of a policy that needs no training. Keys and their meaning stand at the classes
+below; a file holds no other keys.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from marl_handover.compose_schema import load_mapping, option_file
+from marl_handover.config import require_at_least, require_choice
+from marl_handover.errors import CorruptFile, HandoverError, UnknownChoice
+from marl_handover.resources import resource_path
+
+RUN = "{run}"
+"""Stands for a trained row's run directory in the name of a policy."""
+
+EVALUATION_SEED_OFFSET = 100
+"""Run k of a row is judged on the problems of this seed plus k."""
+
+SIZES = ("full", "quick")
+FIGURES = ("curves", "bars", "end_states", "profiles", "workspace")
+TABLES = ("evaluation", "milestones", "runs", "comparison")
+CURVE_MEASURES = ("success_rate", "mean_steps", "steps_ratio", "training_success_rate", "training_mean_length")
+BAR_MEASURES = ("success_rate", "success_in_the_end", "mean_steps", "steps_ratio")
+CURVE_AXES = ("step", "share")
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
+Spec = TypeVar("Spec")
+
+
+@dataclass
+class RowSpec:
+    """One thing that is compared."""
+
+    name: str = ""  # of its folder; small letters, digits, underscores
+    label: str = ""  # in tables and figures; the name if empty
+    train: list[str] | None = None  # arguments of `train`; [] trains with the defaults; left out: nothing is trained
+    policy: str = ""  # a policy by name, for a row that is not trained
+    evaluate: list[str] = field(default_factory=list)  # arguments put after those of every evaluation
+    seeds: int = 0  # 0: the suite's
+
+
+@dataclass
+class EvaluationSpec:
+    """One way of judging every row, or those in ``rows``."""
+
+    name: str = ""
+    label: str = ""
+    arguments: list[str] = field(default_factory=list)  # of `evaluate`
+    policy: str = ""  # instead of the row's own, such as shielded:{run}; {run} is the row's run directory
+    rows: list[str] = field(default_factory=list)  # empty: all
+    seeds: int = 0  # the first so many of a row's runs; 0: all
+
+
+@dataclass
+class FigureSpec:
+    """One picture, as PNG and PDF."""
+
+    name: str = ""
+    kind: str = ""  # curves, bars, end_states, profiles, workspace
+    title: str = ""
+    rows: list[str] = field(default_factory=list)  # empty: all that have such values
+    evaluations: list[str] = field(default_factory=list)  # empty: all; end_states takes one
+    measure: str = "success_rate"  # of curves and bars
+    x: str = "step"  # of curves: step, or share of the run's training
+
+
+@dataclass
+class TableSpec:
+    """One table, as Markdown and CSV."""
+
+    name: str = ""
+    kind: str = ""  # evaluation, milestones, runs, comparison
+    title: str = ""
+    rows: list[str] = field(default_factory=list)
+    evaluations: list[str] = field(default_factory=list)
+    pairs: list[list[str]] = field(default_factory=list)  # of comparison: [better?, than]
+
+
+@dataclass
+class QuickSpec:
+    """The smoke size: arguments put after all others."""
+
+    seeds: int = 2
+    train: list[str] = field(default_factory=list)
+    evaluate: dict[str, list[str]] = field(default_factory=dict)  # by evaluation
+
+
+@dataclass
+class Suite:
+    """A suite as read and checked."""
+
+    name: str
+    title: str = ""
+    seeds: int = 5
+    train: list[str] = field(default_factory=list)  # arguments put before every row's own
+    rows: list[RowSpec] = field(default_factory=list)
+    evaluations: list[EvaluationSpec] = field(default_factory=list)
+    figures: list[FigureSpec] = field(default_factory=list)
+    tables: list[TableSpec] = field(default_factory=list)
+    quick: QuickSpec = field(default_factory=QuickSpec)
+    size: str = "full"
+
+    def row(self, name: str) -> RowSpec:
+        """The row of that name."""
+        return next(row for row in self.rows if row.name == name)
+
+    def seeds_of(self, row: RowSpec) -> range:
+        """Training seeds of a row."""
+        return range(row.seeds or self.seeds)
+
+    def evaluations_of(self, row: RowSpec, seed: int) -> list[EvaluationSpec]:
+        """The evaluations that run ``seed`` of a row gets."""
+        return [spec for spec in self.evaluations if _applies(spec, row) and seed < (spec.seeds or seed + 1)]
+
+    def train_arguments(self, row: RowSpec) -> list[str]:
+        """Arguments of ``train`` for a row, weak ones first."""
+        assert row.train is not None
+        return [*self.train, *row.train, *(self.quick.train if self.size == "quick" else [])]
+
+    def evaluate_arguments(self, row: RowSpec, spec: EvaluationSpec) -> list[str]:
+        """Arguments of ``evaluate`` for a row, weak ones first, policy and seed left out."""
+        quick = self.quick.evaluate.get(spec.name, []) if self.size == "quick" else []
+        return [*spec.arguments, *row.evaluate, *quick]
+
+    def policy_of(self, row: RowSpec, spec: EvaluationSpec) -> str:
+        """Name of the policy that is judged, which may hold :data:`RUN`."""
+        return spec.policy or row.policy or RUN
+
+    def sized(self, size: str) -> Suite:
+        """This suite in full, or in its smoke size: fewer seeds, shorter runs.
+
+        Raises:
+            UnknownChoice: another size.
+        """
+        require_choice("preset", size, SIZES)
+        if size == "full":
+            return self
+        return self.with_seeds(self.quick.seeds, at_most=True, size="quick")
+
+    def with_seeds(self, count: int, at_most: bool = False, **changes: Any) -> Suite:
+        """This suite with ``count`` seeds for every row and evaluation, or with no more than those."""
+        require_at_least("seeds", count, 1)
+
+        def less(own: int) -> int:
+            return min(own or self.seeds, count) if at_most else count
+
+        rows = [replace(row, seeds=less(row.seeds)) for row in self.rows]
+        evaluations = [replace(spec, seeds=less(spec.seeds) if spec.seeds else 0) for spec in self.evaluations]
+        return replace(self, seeds=less(self.seeds), rows=rows, evaluations=evaluations, **changes)
+
+    def with_rows(self, names: Sequence[str]) -> Suite:
+        """This suite with some of its rows; all if ``names`` is empty. Raises :class:`UnknownChoice`."""
+        for name in names:
+            if name not in [row.name for row in self.rows]:
+                raise UnknownChoice("rows", name, [row.name for row in self.rows])
+        return replace(self, rows=[row for row in self.rows if not names or row.name in names])
+
+
+def suite_folder() -> Path:
+    """Where the shipped suites are."""
+    return resource_path("configs") / "suite"
+
+
+def load_suite(name: str) -> Suite:
+    """A suite by name, or by the path of a YAML file.
+
+    Raises:
+        UnknownChoice, MissingFile: there is none.
+        CorruptFile: it is no suite; names the entry.
+    """
+    path = option_file("suite", name, suite_folder(), None)
+    tree = load_mapping(path, "suite")
+    lists = {"rows": RowSpec, "evaluations": EvaluationSpec, "figures": FigureSpec, "tables": TableSpec}
+    parts: dict[str, Any] = {}
+    for key, schema in lists.items():
+        entries = tree.pop(key, None) or []
+        if not isinstance(entries, list):
+            raise CorruptFile("suite", path, f"{key}: expected a list, one entry a line")
+        parts[key] = [_fitted(schema, entry, path, f"{key}[{number}]") for number, entry in enumerate(entries)]
+    parts["quick"] = _fitted(QuickSpec, tree.pop("quick", None) or {}, path, "quick")
+    head = _fitted(_Head, tree, path, "the file", also=(*lists, "quick"))
+    suite = Suite(path.stem, head.title or path.stem, head.seeds, head.train, **parts)
+    try:
+        _check(suite)
+    except HandoverError as error:
+        raise CorruptFile("suite", path, str(error)) from error
+    return suite
+
+
+@dataclass
+class _Head:
+    title: str = ""
+    seeds: int = 5
+    train: list[str] = field(default_factory=list)
+
+
+def _fitted(schema: type[Spec], tree: Any, path: Path, where: str, also: Iterable[str] = ()) -> Spec:
+    """An instance of ``schema``. Raises :class:`CorruptFile` that names the entry and the key."""
+    if not isinstance(tree, Mapping):
+        raise CorruptFile("suite", path, f"{where}: expected key: value pairs, got {tree!r}")
+    where += f" ({tree['name']})" if tree.get("name") else ""
+    known = [item.name for item in fields(schema)]  # type: ignore[arg-type]  # a dataclass
+    for key in tree:
+        if key not in known:
+            raise CorruptFile("suite", path, f"{where}: unknown key {key!r}; keys: {', '.join([*known, *also])}")
+    try:
+        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.create(dict(tree))))  # type: ignore[return-value]
+    except OmegaConfBaseException as error:
+        raise CorruptFile("suite", path, f"{where}: {str(error).splitlines()[0]}") from error
+
+
+def _applies(spec: EvaluationSpec, row: RowSpec) -> bool:
+    """Whether the row is judged so: it is named, or all are, except that an untrained one has no run to name."""
+    return row.name in spec.rows if spec.rows else row.train is not None or RUN not in spec.policy
+
+
+def _check(suite: Suite) -> None:
+    """Raise a :class:`HandoverError` unless names are unique, references exist and every row has one source."""
+    require_at_least("seeds", suite.seeds, 1)
+    require_at_least("quick.seeds", suite.quick.seeds, 1)
+    require_at_least("number of rows", len(suite.rows), 1)
+    for what in ("rows", "evaluations", "figures", "tables"):
+        names: list[str] = []
+        for spec in getattr(suite, what):
+            if not _NAME.fullmatch(spec.name):
+                raise BadEntry(f"{what}: name {spec.name!r}", "small letters, digits and underscores make a name")
+            if spec.name in names:
+                raise BadEntry(f"{what}: {spec.name}", "the name is taken")
+            names.append(spec.name)
+    rows, evaluations = [row.name for row in suite.rows], [spec.name for spec in suite.evaluations]
+    for row in suite.rows:
+        _check_row(row)
+    for spec in suite.evaluations:
+        require_at_least(f"seeds of {spec.name}", spec.seeds, 0)
+        for name in spec.rows:
+            require_choice(f"evaluations: {spec.name}: rows", name, tuple(rows))
+            if RUN in spec.policy and suite.row(name).train is None:
+                raise BadEntry(f"evaluations: {spec.name}", f"row {name} is not trained, so it has no {RUN}")
+    for name in suite.quick.evaluate:
+        require_choice("quick.evaluate", name, tuple(evaluations))
+    for part, kinds in (("figures", FIGURES), ("tables", TABLES)):
+        for entry in getattr(suite, part):
+            require_choice(f"{part}: {entry.name}: kind", entry.kind, kinds)
+            for key, known in (("rows", rows), ("evaluations", evaluations)):
+                for name in getattr(entry, key):
+                    require_choice(f"{part}: {entry.name}: {key}", name, tuple(known))
+    for figure in suite.figures:
+        require_choice(f"figures: {figure.name}: measure", figure.measure, CURVE_MEASURES if figure.kind == "curves" else BAR_MEASURES)
+        require_choice(f"figures: {figure.name}: x", figure.x, CURVE_AXES)
+    for table in suite.tables:
+        for pair in table.pairs:
+            if len(pair) != 2:
+                raise BadEntry(f"tables: {table.name}: pairs: {pair}", "a pair has two rows")
+            for name in pair:
+                require_choice(f"tables: {table.name}: pairs", name, tuple(rows))
+
+
+def _check_row(row: RowSpec) -> None:
+    require_at_least(f"seeds of {row.name}", row.seeds, 0)
+    if (row.train is None) == (not row.policy):
+        raise BadEntry(f"rows: {row.name}", "give `train`, a list that may be empty, or `policy`, one of the two")
+    if RUN in row.policy:
+        raise BadEntry(f"rows: {row.name}: policy", f"{RUN} belongs into an evaluation's policy; a row with a policy is not trained")
+
+
+class BadEntry(HandoverError):
+    """An entry of a suite that makes no sense."""
+
+    def __init__(self, where: str, reason: str) -> None:
+        super().__init__(f"{where}: {reason}")
+        self.where, self.reason = where, reason

@@ -1,0 +1,192 @@
+"""Tables of a suite's results, as Markdown for people and as CSV for programs."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+Tree = Mapping[str, Any]
+NONE = "–"
+
+
+class Cell(NamedTuple):
+    """``text`` is shown; ``values`` are what the CSV has, one for each part of the column."""
+
+    text: str
+    values: tuple[Any, ...]
+
+
+class Column(NamedTuple):
+    """A heading, and the CSV's heading of each part; one part of the same name unless given."""
+
+    title: str
+    parts: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The CSV's headings."""
+        return self.parts or (self.title,)
+
+
+class Table(NamedTuple):
+    """A table by name."""
+
+    name: str
+    title: str
+    columns: list[Column]
+    rows: list[list[Cell]]
+
+
+def make_tables(results: Tree) -> list[Table]:
+    """The tables that the suite asked for, those without a row left out.
+
+    Args:
+        results: content of ``results.json``.
+    """
+    makers: dict[str, Callable[[Tree, Tree], tuple[list[Column], list[list[Cell]]]]] = {
+        "evaluation": _evaluation,
+        "milestones": _milestones,
+        "runs": _runs,
+        "comparison": _comparison,
+    }
+    tables = [Table(spec["name"], spec["title"] or spec["name"], *makers[spec["kind"]](results, spec)) for spec in results["tables"]]
+    return [table for table in tables if table.rows]
+
+
+def markdown(table: Table) -> str:
+    """The table in Markdown, without its title."""
+    lines = [[column.title for column in table.columns], ["---"] * len(table.columns)]
+    lines += [[cell.text for cell in row] for row in table.rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def csv_text(table: Table) -> str:
+    """The table as CSV, numbers in full."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([name for column in table.columns for name in column.names])
+    for row in table.rows:
+        writer.writerow(["" if value is None else value for cell in row for value in cell.values])
+    return stream.getvalue()
+
+
+def _wanted(results: Tree, names: Sequence[str]) -> list[Tree]:
+    """Rows in the order asked for, or all."""
+    rows = {row["name"]: row for row in results["rows"]}
+    return [rows[name] for name in names or rows if name in rows]
+
+
+def _text(value: Any) -> Cell:
+    return Cell(str(value), (value,))
+
+
+def _plain(value: float | None, form: str = "{:,.0f}", scale: float = 1.0) -> Cell:
+    return Cell(NONE if value is None else form.format(scale * value), (value,))
+
+
+def _interval(found: Tree | None, form: str, scale: float = 1.0) -> Cell:
+    """``value [low, high]``; CSV: value, low, high, all in the JSON's own units."""
+    if found is None:
+        return Cell(NONE, (None, None, None))
+    value, low, high = found["value"], found["low"], found["high"]
+    ends = "" if low is None else f" [{form.format(scale * low)}, {form.format(scale * high)}]"
+    return Cell(form.format(scale * value) + ends, (value, low, high))
+
+
+def _interval_column(title: str, name: str) -> Column:
+    return Column(title, (name, f"{name}_low", f"{name}_high"))
+
+
+def _evaluation(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
+    """Success and steps of each row on each evaluation."""
+    labels = {item["name"]: item["label"] or item["name"] for item in results["evaluations"]}
+    wanted = spec["evaluations"] or list(labels)
+    shown = [(row, name) for name in wanted for row in _wanted(results, spec["rows"]) if name in row["evaluations"]]
+    in_the_end = any("success_in_the_end" in row["evaluations"][name] for row, name in shown)
+    columns = [
+        Column("row"),
+        Column("evaluation"),
+        Column("seeds"),
+        Column("episodes"),
+        _interval_column("success, %", "success_rate"),
+        *([_interval_column("in the end, %", "success_in_the_end")] if in_the_end else []),
+        Column("mean, %", ("success_rate_mean",)),
+        _interval_column("mean steps", "mean_steps"),
+        _interval_column("steps ÷ optimum", "steps_ratio"),
+    ]
+    rows = []
+    for row, name in shown:
+        found = row["evaluations"][name]
+        rows.append(
+            [
+                _text(row["label"]),
+                _text(labels[name]),
+                _text(found["runs"]),
+                _plain(found["episodes"]),
+                _interval(found["success_rate"], "{:.2f}", 100),
+                *([_interval(found.get("success_in_the_end"), "{:.2f}", 100)] if in_the_end else []),
+                _plain(found["success_rate"]["mean"], "{:.2f}", 100),
+                _interval(found["mean_steps"], "{:.2f}"),
+                _interval(found.get("steps_ratio"), "{:.3f}"),
+            ]
+        )
+    return columns, rows
+
+
+def _milestones(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
+    """Transfers until the validation success is at a level: median over the runs, its interval, how many got there."""
+    shown = [row for row in _wanted(results, spec["rows"]) if row["milestones"]]
+    levels = list(shown[0]["milestones"]) if shown else []
+    parts = ("median", "low", "high", "reached", "runs")
+    columns = [Column("row"), Column("transfers in all", ("transfers",))]
+    columns += [Column(f"to {level} %", tuple(f"to_{level}_{part}" for part in parts)) for level in levels]
+    rows = [
+        [_text(row["label"]), _plain(row["settings"]["steps"]), *(_cost(row["milestones"][level], parts) for level in levels)]
+        for row in shown
+    ]
+    return columns, rows
+
+
+def _cost(found: Tree, parts: Sequence[str]) -> Cell:
+    def number(value: float | None) -> str:
+        return "never" if value is None else f"{value:,.0f}"
+
+    ends = f" [{number(found['low'])}, {number(found['high'])}]" if found["runs"] > 1 else ""
+    return Cell(f"{number(found['median'])}{ends}, {found['reached']} of {found['runs']}", tuple(found[part] for part in parts))
+
+
+def _runs(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
+    """What was trained: arguments, size, time, commit."""
+    titles = ("row", "arguments", "seeds", "transfers", "gradient steps", "minutes a run", "commit")
+    rows = []
+    for row in _wanted(results, spec["rows"]):
+        done = [run["trained"] for run in row["runs"] if run["trained"]]
+        if not done:
+            continue
+        minutes = sum(run["wall_s"] for run in done) / len(done) / 60
+        gradient_steps = sum(run["gradient_step"] for run in done) / len(done)
+        arguments = " ".join(row["arguments"]) or "(defaults)"
+        commits = ", ".join(dict.fromkeys(run["commit"] for run in done))
+        sizes = (_text(len(done)), _plain(row["settings"]["steps"]), _plain(gradient_steps), _plain(minutes, "{:.1f}"))
+        rows.append([_text(row["label"]), Cell(f"`{arguments}`", (arguments,)), *sizes, _text(commits)])
+    return [Column(title) for title in titles], rows
+
+
+def _comparison(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
+    """Probability that a run of the first row beats one of the second."""
+    labels = {row["name"]: row["label"] for row in results["rows"]}
+    names = {item["name"]: item["label"] or item["name"] for item in results["evaluations"]}
+    entries = [entry for entry in results["comparisons"] if entry["table"] == spec["name"]]
+    wanted = [name for name in names if any(name in entry["evaluations"] for entry in entries)]
+    columns = [Column("P(first beats second)", ("first", "second"))]
+    columns += [_interval_column(f"success, {names[name]}", f"better_{name}") for name in wanted]
+    columns += [_interval_column("sooner at 95 %", "sooner_at_95")]
+    rows = []
+    for entry in entries:
+        first, second = entry["first"], entry["second"]
+        cells = [Cell(f"{labels[first]} – {labels[second]}", (first, second))]
+        cells += [_interval(entry["evaluations"].get(name), "{:.2f}") for name in wanted]
+        rows.append([*cells, _interval(entry["sooner"], "{:.2f}")])
+    return columns, rows

@@ -1,0 +1,218 @@
+"""A search for better settings of training: an Optuna study whose trials are short training runs.
+
+A trial is judged by the trainer's own score on its validation problems, never on those of evaluations. Studies continue: a second call does
+the trials that are left, and those whose process was killed are started again from their first step, with the same settings and seed.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
+from optuna.study import Study
+from optuna.trial import Trial, TrialState
+
+from marl_handover.compare.launch import Failure, fan_out
+from marl_handover.compare.records import settings_of, usual_settings
+from marl_handover.compare.tune_space import Parameter, applied, value_of
+from marl_handover.compare.tune_storage import abandoned, claimed, counted, give_back, open_study, running
+from marl_handover.compare.workers import summary
+from marl_handover.config import MAX_SEED
+from marl_handover.errors import HandoverError, WorkFailed
+from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.trainer import Trainer, validation_score
+
+PRUNERS = ("median", "hyperband", "none")
+STARTUP_TRIALS = 5
+"""Finished trials before the median is one."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a study is about; every worker gets one.
+
+    Attributes:
+        study: its name.
+        storage: URL or path, see :func:`marl_handover.compare.tune_storage.open_storage`.
+        train: the settings that are searched from.
+        space: what is changed.
+        origin: the file that the space was read from, for errors.
+        folder: trials train in its subfolders.
+        trials: how many the study should have in the end.
+        seed: of the search, and of its trials' seeds.
+        pruner: ``median``, ``hyperband`` or ``none``.
+    """
+
+    study: str
+    storage: str
+    train: TrainConfig
+    space: tuple[Parameter, ...]
+    origin: Path
+    folder: Path
+    trials: int
+    seed: int
+    pruner: str
+
+
+@dataclass(frozen=True)
+class Note:
+    """How a trial went. ``value`` is None if it failed."""
+
+    number: int
+    state: str
+    value: float | None
+    error: str = ""
+
+
+class ChangedStudy(HandoverError):
+    """A study that was begun with other settings."""
+
+    def __init__(self, study: str, key: str, stored: Any, asked: Any) -> None:
+        super().__init__(f"study {study} was begun with {key} = {stored!r}, and now it is {asked!r}; give this one another name: study=…")
+        self.study, self.key, self.stored, self.asked = study, key, stored, asked
+
+
+def prepare(search: Search) -> tuple[Study, int]:
+    """The study, begun or continued, and how many trials are left. Trials whose process is gone are queued again.
+
+    Raises:
+        ChangedStudy: it was begun with other settings, another space or another seed.
+        StorageUnavailable: its storage cannot be opened.
+    """
+    study = open_study(search.storage, search.study)
+    about = {**settings_of(search.train), **{f"search.{parameter.key}": parameter.about() for parameter in search.space}}
+    stored = study.user_attrs.get("about")
+    if stored is None:
+        study.set_user_attr("about", about)
+        _propose_usual(study, search)
+    else:
+        _compare(search, stored, about)
+    for trial in running(study):
+        if abandoned(trial):
+            give_back(study, trial)
+    return study, max(0, search.trials - counted(study))
+
+
+def _propose_usual(study: Study, search: Search) -> None:
+    """The first trial has the settings as they are, so that what is found is at least as good, if the space has them."""
+    usual = {parameter.key: value_of(search.train, parameter.key) for parameter in search.space}
+    if all(parameter.contains(usual[parameter.key]) for parameter in search.space):
+        study.enqueue_trial({parameter.key: parameter.stored(usual[parameter.key]) for parameter in search.space})
+
+
+def _compare(search: Search, stored: dict[str, Any], about: dict[str, Any]) -> None:
+    younger = usual_settings(search.train)  # a setting that an old study does not know had its default
+    for key in sorted(stored.keys() | about.keys()):
+        before, now = stored.get(key, younger.get(key)), about.get(key)
+        if before != now and (key in about or key.startswith("search.")):
+            raise ChangedStudy(search.study, key, before, now)
+
+
+def run_trials(search: Search, study: Study, left: int, **options: Any) -> Generator[Note, None, None]:
+    """Do ``left`` trials and tell how each went. ``options`` go to :func:`marl_handover.compare.launch.fan_out`."""
+    begun = counted(study)
+    slots = [f"{search.seed}/{begun + index}" for index in range(left)]
+    for slot, result in fan_out(partial(run_trial, search), slots, label=lambda slot: f"trial {slot.partition('/')[2]}", **options):
+        if not isinstance(result, Failure):
+            if result is not None:
+                yield result
+            continue
+        for trial in running(study):
+            if trial.user_attrs.get("slot") == slot:
+                give_back(study, trial, again=False)
+        yield Note(-1, "FAIL", None, result.error)
+
+
+def run_trial(search: Search, slot: str) -> Note | None:
+    """One trial, in a worker. None if others have done enough meanwhile.
+
+    Args:
+        search: what to do.
+        slot: seed of the study and place in it. One that is run again takes over what a dead worker left.
+    """
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    seed = _seed(search.seed, int(slot.partition("/")[2]), "proposals")
+    study = open_study(search.storage, search.study, seed, _pruner(search))
+    for left in running(study):
+        if left.user_attrs.get("slot") == slot:
+            give_back(study, left)
+    if counted(study) >= search.trials:
+        return None
+    trial = study.ask()
+    try:
+        with claimed(trial, slot):
+            value = _train(search, trial)
+    except optuna.TrialPruned:
+        ended = study.tell(trial, state=TrialState.PRUNED)
+    except Exception as error:  # settings that cannot be trained with are a result of a search like others
+        trial.set_user_attr("error", summary(error))
+        study.tell(trial, state=TrialState.FAIL)
+        return Note(trial.number, "FAIL", None, summary(error))
+    except BaseException:
+        give_back(study, study.trials[trial.number])
+        raise
+    else:
+        ended = study.tell(trial, value)
+    return Note(trial.number, ended.state.name, ended.value)
+
+
+def _train(search: Search, trial: Trial) -> float:
+    """Train with a trial's settings and return its score."""
+    values = {parameter.key: parameter.suggest(trial) for parameter in search.space}
+    seed = _seed(search.seed, trial.user_attrs.get("origin", trial.number), "training")
+    folder = search.folder / f"{trial.number:04d}"
+    config = replace(applied(search.train, values, search.origin), seed=seed, out=str(folder), resume="", progress=False)
+    trial.set_user_attr("seed", seed)
+    rows: list[dict[str, float]] = []
+
+    def judge(row: dict[str, float]) -> None:
+        rows.append(row)
+        trial.report(validation_score(row), len(rows))
+        if row["step"] < config.steps and trial.should_prune():
+            raise optuna.TrialPruned
+
+    try:
+        best_step = Trainer(config, folder, judge).run()["best_step"]
+        best = next(row for row in rows if row["step"] == best_step)
+    finally:
+        _describe(trial, max(rows, key=validation_score, default={}))
+    _describe(trial, best)
+    return validation_score(best)
+
+
+def _describe(trial: Trial, row: dict[str, float]) -> None:
+    for name in ("step", "success_rate", "mean_steps", "steps_ratio", "wall_s"):
+        if math.isfinite(row.get(name, math.nan)):
+            trial.set_user_attr(name, row[name])
+
+
+def _pruner(search: Search) -> BasePruner:
+    """Resources are counted in validations."""
+    validations = math.ceil(search.train.steps / search.train.evaluation_interval)
+    pruners: dict[str, Callable[[], BasePruner]] = {
+        "median": lambda: MedianPruner(n_startup_trials=STARTUP_TRIALS, n_warmup_steps=validations // 4 + 1),
+        "hyperband": lambda: HyperbandPruner(min_resource=1, max_resource=max(2, validations)),
+        "none": NopPruner,
+    }
+    return pruners[search.pruner]()
+
+
+def _seed(study_seed: int, index: int, purpose: str) -> int:
+    """A seed that depends on these alone."""
+    sequence = np.random.SeedSequence([study_seed, index, len(purpose)])
+    return int(sequence.generate_state(1)[0]) % MAX_SEED
+
+
+def require_result(study: Study, notes: list[Note]) -> None:
+    """Raise :class:`WorkFailed` if no trial of the study was completed."""
+    if not study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+        reasons = [note.error for note in notes if note.error]
+        raise WorkFailed(f"no trial of study {study.study_name} was completed" + (f": {reasons[0]}" if reasons else ""))

@@ -1,0 +1,160 @@
+"""Where a study is kept: a journal file, or a database by URL, whose password is never shown."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import optuna
+from optuna.samplers import TPESampler
+from optuna.storages import BaseStorage, JournalStorage, RDBStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.study import Study
+from optuna.trial import FrozenTrial, Trial, TrialState
+from sqlalchemy.exc import SQLAlchemyError
+
+from marl_handover.errors import HandoverError
+
+BEAT_S = 60.0
+"""A trial that runs says so this often ..."""
+SILENT_S = 600.0
+"""... and one on another machine that has been silent for so long is taken for dead."""
+TRIES = 3
+"""So often a trial is started whose process dies."""
+SQLITE_WAIT_S = 60.0
+DRIVERS = {"psycopg": "'psycopg[binary]'", "psycopg2": "psycopg2-binary", "MySQLdb": "mysqlclient"}
+"""Packages that are not called as their modules are."""
+
+
+class StorageUnavailable(HandoverError):
+    """A study's storage cannot be opened."""
+
+    def __init__(self, storage: str, reason: str) -> None:
+        super().__init__(f"storage={hidden(storage)}: {' '.join(hidden(reason).split())}")
+
+
+def hidden(text: str) -> str:
+    """``text`` with every password of a URL in it replaced by stars."""
+    text = re.sub(r":(?!//)\S*@", ":***@", text)
+    return re.sub(r"(password=)[^&\s]+", r"\1***", text)
+
+
+def located(storage: str, folder: Path) -> str:
+    """``storage`` as workers need it, who may stand in another folder; a journal file in ``folder`` if it is empty.
+
+    Raises :class:`StorageUnavailable` for a URL without its slashes, which would pass for a path.
+    """
+    if "://" in storage:
+        return storage
+    if re.match(r"\w+:", storage):
+        raise StorageUnavailable(storage, "is neither a URL, such as postgresql://user:password@host/name, nor the path of a journal file")
+    return str(Path(storage or folder / "study.journal").absolute())
+
+
+def open_storage(storage: str) -> BaseStorage:
+    """The storage that a URL (``postgresql://user:password@host/name``, ``sqlite:///file``) or the path of a journal file means.
+
+    Raises:
+        StorageUnavailable: for one line about whatever is wrong with it.
+    """
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        if "://" not in storage:
+            Path(storage).parent.mkdir(parents=True, exist_ok=True)
+            return JournalStorage(JournalFileBackend(storage))
+        wait: dict[str, Any] = {"connect_args": {"timeout": SQLITE_WAIT_S}} if storage.startswith("sqlite") else {"pool_pre_ping": True}
+        return RDBStorage(storage, engine_kwargs=wait)
+    except ImportError as error:
+        missing = getattr(error.__cause__ or error, "name", None) or "its driver"
+        raise StorageUnavailable(storage, f"needs the package {missing}; run: pip install {DRIVERS.get(missing, missing)}") from None
+    except (SQLAlchemyError, optuna.exceptions.OptunaError, OSError, ValueError, RuntimeError) as error:
+        # The chain would show the URL, password and all, in a traceback.
+        raise StorageUnavailable(storage, f"cannot be opened: {(str(error).splitlines() or [type(error).__name__])[0]}") from None
+
+
+def open_study(storage: str, name: str, seed: int | None = None, pruner: optuna.pruners.BasePruner | None = None) -> Study:
+    """The study of that name, made if it is not there; the higher the value, the better. ``seed``: of what it proposes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return optuna.create_study(
+            study_name=name,
+            storage=open_storage(storage),
+            sampler=TPESampler(seed=seed),
+            pruner=pruner or optuna.pruners.NopPruner(),
+            direction="maximize",
+            load_if_exists=True,
+        )
+
+
+def counted(study: Study) -> int:
+    """How many trials are done, or under way, or failed; one that was given back counts through its successor."""
+    trials = study.get_trials(deepcopy=False)
+    replaced = {trial.user_attrs.get("again_of") for trial in trials}
+    return sum(trial.state != TrialState.WAITING and trial.number not in replaced for trial in trials)
+
+
+@contextmanager
+def claimed(trial: Trial, slot: str) -> Iterator[None]:
+    """Say whose the trial is, and that it is alive, for as long as the block runs."""
+    trial.set_user_attr("slot", slot)
+    trial.set_user_attr("worker", _me())
+    over = threading.Event()
+
+    def beat() -> None:
+        while not over.wait(BEAT_S):
+            trial.set_user_attr("beat", time.time())
+
+    trial.set_user_attr("beat", time.time())
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def abandoned(trial: FrozenTrial) -> bool:
+    """Whether a running trial's process is gone. On another machine than this, silence tells."""
+    worker, beat = trial.user_attrs.get("worker"), trial.user_attrs.get("beat", 0.0)
+    if worker is not None and worker["host"] == socket.gethostname():
+        return bool(_started(worker["pid"]) != worker["started"])
+    begun = trial.datetime_start.timestamp() if trial.datetime_start is not None else 0.0
+    return time.time() - max(beat, begun) > SILENT_S
+
+
+def give_back(study: Study, trial: FrozenTrial, again: bool = True) -> None:
+    """Fail a trial whose process died, and queue its settings once more, unless they were tried too often."""
+    try:
+        study.tell(trial.number, state=TrialState.FAIL)
+    except (ValueError, RuntimeError):
+        return  # somebody else was faster
+    tries = int(trial.user_attrs.get("tries", 1))
+    if again and tries < TRIES:
+        about = {"again_of": trial.number, "origin": trial.user_attrs.get("origin", trial.number), "tries": tries + 1}
+        study.enqueue_trial(trial.params, user_attrs=about)
+
+
+def running(study: Study) -> list[FrozenTrial]:
+    """Trials that were started and not ended."""
+    return study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+
+
+def _me() -> dict[str, Any]:
+    return {"host": socket.gethostname(), "pid": os.getpid(), "started": _started(os.getpid())}
+
+
+def _started(pid: int) -> str | None:
+    """When the process of that number was started, in ticks since boot: numbers are given out again, these pairs are not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        return None

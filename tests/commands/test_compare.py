@@ -1,0 +1,203 @@
+"""``marl-handover compare``: a whole small suite, done once, resumed, reported, with failures that stay apart."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from marl_handover.cli import main
+
+SUITE = """
+title: Small
+seeds: 2
+train: [compile=off, steps=768, num_envs=16, evaluation_interval=256, evaluation_episodes=30, checkpoint_interval=768,
+        algorithm.learning_starts=200, algorithm.batch_size=16]
+rows:
+  - {name: b, label: learned, train: []}
+  - {name: exact, label: exact planner, policy: exact}
+  - {name: random, policy: random}
+evaluations:
+  - {name: kinematic, arguments: [episodes=40]}
+  - {name: noise, label: with noise, arguments: [episodes=40, "task.noise={position_mm:2,yaw_deg:2}"], rows: [b, exact], seeds: 1}
+figures:
+  - {name: learning, kind: curves}
+  - {name: length, kind: curves, measure: training_mean_length, x: share}
+  - {name: success, kind: bars}
+  - {name: endings, kind: end_states, evaluations: [kinematic]}
+  - {name: profiles, kind: profiles, evaluations: [kinematic]}
+  - {name: workspace, kind: workspace}
+tables:
+  - {name: success, kind: evaluation}
+  - {name: costs, kind: milestones}
+  - {name: pairs, kind: comparison, pairs: [[exact, b], [b, random]]}
+  - {name: runs, kind: runs}
+quick: {seeds: 1, train: [steps=256], evaluate: {kinematic: [episodes=5]}}
+"""
+FIGURES = ("learning", "length", "success", "endings", "profiles", "workspace")
+TABLES = ("success", "costs", "pairs", "runs")
+
+
+def compared(folder: Path, *arguments: str) -> int:
+    return main(["compare", f"suite={folder / 'small.yaml'}", f"out={folder / 'out'}", "jobs=1", "progress=false", *arguments])
+
+
+def results(folder: Path):
+    return json.loads((folder / "out/results.json").read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("compare")
+    (folder / "small.yaml").write_text(SUITE)
+    assert compared(folder) == 0
+    return folder
+
+
+def test_every_figure_and_table_is_there(home):
+    assert {path.name for path in (home / "out/figures").iterdir()} == {f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf")}
+    assert {path.name for path in (home / "out/tables").iterdir()} == {f"{name}.{kind}" for name in TABLES for kind in ("md", "csv")}
+
+
+def test_results_hold_settings_seeds_and_commits_beside_the_numbers(home):
+    found = results(home)
+    assert (found["suite"], found["size"], found["missing"], found["failures"]) == ("small", "full", [], {})
+    rows = {row["name"]: row for row in found["rows"]}
+    assert rows["b"]["settings"]["steps"] == 768
+    assert rows["b"]["seeds"] == [0, 1]
+    assert rows["exact"]["settings"] is None
+    for row in rows.values():
+        for run in row["runs"]:
+            for name, report in run["evaluations"].items():
+                stored = json.loads((home / f"out/{row['name']}/seed{run['seed']}/{name}.json").read_text())
+                assert (report["success_rate"], report["seed"]) == (stored["success_rate"], 100 + run["seed"])
+                assert report["commit"] == stored["provenance"]["commit"]
+    assert found["commits"]
+    kinematic = rows["random"]["evaluations"]["kinematic"]
+    own = [run["evaluations"]["kinematic"] for run in rows["random"]["runs"]]
+    assert kinematic["success_rate"]["mean"] == pytest.approx(np.mean([report["success_rate"] for report in own]))
+    assert kinematic["outcomes"] == {key: sum(report["outcomes"][key] for report in own) for key in kinematic["outcomes"]}
+    assert rows["exact"]["evaluations"]["kinematic"]["success_rate"]["value"] == 1.0
+    assert (rows["exact"]["evaluations"]["noise"]["runs"], "noise" in rows["random"]["evaluations"]) == (1, False)
+    assert rows["b"]["curves"]["success_rate"]["step"] == [256, 512, 768]
+    assert rows["b"]["milestones"]["99"]["runs"] == 2
+
+
+def test_tables_say_what_the_results_say(home):
+    found = results(home)
+    with (home / "out/tables/success.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    assert [(line["row"], line["evaluation"]) for line in lines] == [
+        *(("learned", "kinematic"), ("exact planner", "kinematic"), ("random", "kinematic")),
+        *(("learned", "with noise"), ("exact planner", "with noise")),
+    ]
+    for line in lines:
+        row = next(row for row in found["rows"] if row["label"] == line["row"])
+        told = row["evaluations"]["kinematic" if line["evaluation"] == "kinematic" else "noise"]
+        assert float(line["success_rate"]) == told["success_rate"]["value"]
+        assert line["mean_steps_high"] == ("" if told["mean_steps"]["high"] is None else str(told["mean_steps"]["high"]))
+    text = (home / "out/tables/success.md").read_text()
+    assert "| exact planner | kinematic | 2 | 80 | 100.00 [100.00, 100.00] | 100.00 |" in text
+    assert "0 of 2" in (home / "out/tables/costs.md").read_text()
+    assert "exact planner – learned | 1.00 [1.00, 1.00]" in (home / "out/tables/pairs.md").read_text()
+
+
+def test_a_second_call_runs_nothing(home, capsys):
+    before = {path: path.stat().st_mtime_ns for path in (home / "out").rglob("done.json")}
+    assert len(before) == 6
+    assert compared(home) == 0
+    assert "6 of 6 runs are done already" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in (home / "out").rglob("done.json")} == before
+
+
+def test_an_interrupted_suite_does_what_is_left(home):
+    lost = home / "out/exact/seed1"
+    kept = {path: path.stat().st_mtime_ns for path in (home / "out").rglob("done.json") if lost not in path.parents}
+    for name in ("done.json", "kinematic.json"):
+        (lost / name).unlink()
+    assert compared(home, "report_only=true") == 0
+    assert results(home)["missing"] == ["exact/seed1"]
+    assert compared(home) == 0
+    assert results(home)["missing"] == []
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+
+
+def test_a_changed_row_is_refused_and_made_anew_on_request(home, tmp_path, capsys):
+    text = SUITE.replace("{name: kinematic, arguments: [episodes=40]}", "{name: kinematic, arguments: [episodes=50]}")
+    (tmp_path / "small.yaml").write_text(text)
+    arguments = ["compare", f"suite={tmp_path / 'small.yaml'}", f"out={home / 'out'}", "jobs=1", "progress=false", "rows=[random]"]
+    before = results(home)
+    assert main(arguments) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    for word in ("random/kinematic", "episodes = 40", "now it is 50", "fresh=[random/kinematic]"):
+        assert word in err
+    assert results(home) == before
+    assert main([*arguments, "fresh=[random/kinematic]"]) == 0
+    assert [run["evaluations"]["kinematic"]["episodes"] for run in results(home)["rows"][0]["runs"]] == [50, 50]
+    assert compared(home, "fresh=[random]") == 0
+
+
+def test_a_failing_row_does_not_stop_the_others(tmp_path, capsys):
+    text = SUITE.replace("{name: random, policy: random}", "{name: random, policy: nowhere/run}")
+    (tmp_path / "small.yaml").write_text(text)
+    assert compared(tmp_path, "rows=[exact,random]") == 1
+    err = capsys.readouterr().err.splitlines()[-1]
+    for word in ("2 of 4 runs failed", "random/seed0", "random/seed1", "nowhere/run"):
+        assert word in err
+    found = results(tmp_path)
+    assert set(found["failures"]) == {"random/seed0", "random/seed1"}
+    assert found["rows"][0]["evaluations"]["kinematic"]["success_rate"]["value"] == 1.0
+    assert (tmp_path / "out/figures/success.png").exists()
+
+
+def test_the_smoke_size_has_a_folder_and_fewer_seeds_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.yaml").write_text(SUITE)
+    assert main(["compare", "suite=./small.yaml", "preset=quick", "jobs=1", "progress=false", "rows=[exact]"]) == 0
+    found = json.loads((tmp_path / "runs/compare/small-quick/results.json").read_text())
+    assert (found["size"], found["rows"][0]["seeds"]) == ("quick", [0])
+    assert found["rows"][0]["evaluations"]["kinematic"]["episodes"] == 5
+
+
+@pytest.mark.parametrize(
+    ("argument", "word"),
+    [
+        ("preset=small", "full, quick"),
+        ("rows=[c]", "b, exact, random"),
+        ("fresh=[c]", "exact, exact/kinematic, exact/noise"),
+        ("seeds=-1", "seeds"),
+        ("launcher=slurm", "loky, ray"),
+        ("suite=papper", "paper"),
+        ("suite=./none.yaml", "none.yaml"),
+        ("suit=x", "suite"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_2(tmp_path, capsys, argument, word):
+    (tmp_path / "small.yaml").write_text(SUITE)
+    assert compared(tmp_path, "rows=[exact]", argument) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1), err
+    assert "Traceback" not in err
+    assert word in err
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path, capsys):
+    (tmp_path / "small.yaml").write_text(SUITE)
+    (tmp_path / "out").write_text("mine")
+    assert compared(tmp_path) == 2
+    assert "a folder; this is a file" in capsys.readouterr().err
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_the_papers_suite_in_its_smoke_size(tmp_path):
+    """Every figure and table of the paper, in minutes."""
+    assert main(["compare", "suite=paper", "preset=quick", f"out={tmp_path}", "jobs=2", "progress=false"]) == 0
+    found = json.loads((tmp_path / "results.json").read_text())
+    assert found["missing"] == []
+    for part, kinds in (("figures", ("png", "pdf")), ("tables", ("md", "csv"))):
+        assert {path.name for path in (tmp_path / part).iterdir()} == {f"{item['name']}.{kind}" for item in found[part] for kind in kinds}

@@ -1,0 +1,190 @@
+"""Tasks: done once, continued where they stopped, refused when they changed, independent of one another's failures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from marl_handover.commands import evaluate, train
+from marl_handover.compare.records import fingerprint, read_record, settings_of, usual_settings
+from marl_handover.compare.runs import ChangedRow, Grammar, IncompleteTask, Task, check_unchanged, clear, execute, finished, plan_tasks
+from marl_handover.compare.suite import load_suite
+from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.trainer import Trainer
+
+TRAIN, EVALUATE = Grammar(train.ALIASES, train.GROUPS), Grammar(evaluate.ALIASES, evaluate.GROUPS)
+TINY = (
+    "compile=off, steps=512, num_envs=16, evaluation_interval=128, evaluation_episodes=20, checkpoint_interval=256, "
+    "algorithm.learning_starts=200, algorithm.batch_size=16, 'algorithm.actor_hidden=[16]', 'algorithm.critic_hidden=[16]'"
+)
+SUITE = f"""
+train: [{TINY}]
+rows:
+  - {{name: b, train: []}}
+  - {{name: exact, policy: exact}}
+evaluations:
+  - {{name: kinematic, arguments: [episodes=20]}}
+  - {{name: shielded, arguments: [episodes=20], policy: "shielded:{{run}}"}}
+"""
+
+
+def planned(folder: Path, text: str = SUITE) -> dict[str, Task]:
+    """Tasks by name, of one seed each."""
+    (folder / "mine.yaml").write_text(text)
+    suite = load_suite(str(folder / "mine.yaml")).with_seeds(1)
+    return {task.row: task for task in plan_tasks(suite, folder / "out", TRAIN, EVALUATE)}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    """A folder in which both tasks are done."""
+    folder = tmp_path_factory.mktemp("suite")
+    for task in planned(folder).values():
+        assert not finished(task)
+        assert execute(task) == task.name
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_a_task_leaves_its_records(home):
+    task = planned(home)["b"]
+    assert finished(task)
+    done = read_record(task.folder / "done.json")
+    trained = read_record(task.folder / "trained.json")
+    assert (done["row"], done["seed"], done["config_hash"]) == ("b", 0, fingerprint(settings_of(task.train)))
+    assert done["arguments"] == list(task.arguments)
+    assert done["commit"]
+    assert done["machine"]["cores"] >= 1
+    assert trained["step"] == 512
+    assert done["wall_s"] > trained["wall_s"] > 0
+    report = read_record(task.folder / "kinematic.json")
+    assert (report["episodes"], report["seed"], report["policy"]) == (20, 100, str(task.folder / "run"))
+    assert done["evaluations"] == {
+        name: read_record(task.folder / f"{name}.json")["provenance"]["config_hash"] for name in ("kinematic", "shielded")
+    }
+
+
+def test_the_shields_figures_are_a_file_of_their_own(home):
+    task = planned(home)["b"]
+    shielded = read_record(task.folder / "shielded.json")
+    assert shielded["policy"] == f"shielded:{task.folder / 'run'}"
+    assert shielded["provenance"]["policy"] == "shielded:{run}"
+    assert not (home / "out/exact/seed0/shielded.json").exists()
+
+
+def test_what_is_done_is_not_done_again(home):
+    before = contents(home / "out")
+    for task in planned(home).values():
+        execute(task)
+    after = contents(home / "out")
+    assert {name: text for name, text in after.items() if not name.endswith("done.json")} == {
+        name: text for name, text in before.items() if not name.endswith("done.json")
+    }
+
+
+def test_a_run_that_was_interrupted_goes_on_from_its_checkpoint(home, tmp_path):
+    class Stopped(Exception):
+        pass
+
+    def stop(row):
+        if row["step"] >= 384:
+            raise Stopped
+
+    task = planned(tmp_path)["b"]
+    with pytest.raises(Stopped):
+        Trainer(task.train, Path(task.train.out), on_evaluation=stop).run()
+    assert not finished(task)
+    begun = (task.folder / "run/metrics.csv").read_text().splitlines()
+    execute(task)
+    assert finished(task)
+    whole = (task.folder / "run/metrics.csv").read_text().splitlines()
+    assert whole[:3] == begun[:3]  # to the checkpoint at 256, the clock's readings included
+    once = (home / "out/b/seed0/run/metrics.csv").read_text().splitlines()
+
+    def timeless(lines):
+        return [[value for index, value in enumerate(line.split(",")) if index != once[0].split(",").index("wall_s")] for line in lines]
+
+    assert timeless(whole) == timeless(once)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what", "key"),
+    [
+        ("steps=512", "steps=640", "row b", "steps = 512, and now it is 640"),
+        ("{name: b, train: []}", "{name: b, train: [algorithm.gamma=0.9]}", "row b", "algorithm.gamma = 0.95"),
+        ("{name: b, train: []}", "{name: b, train: [algorithm=td3]}", "row b", "algorithm.name = 'sac'"),
+        ("arguments: [episodes=20]}", "arguments: [episodes=30]}", "evaluation b/kinematic", "episodes = 20"),
+        ('"shielded:{run}"', '"{run}"', "evaluation b/shielded", "policy = 'shielded:{run}'"),
+    ],
+)
+def test_a_changed_row_is_refused_by_name_and_key(home, old, new, what, key):
+    text = SUITE.replace("'algorithm.actor_hidden=[16]', 'algorithm.critic_hidden=[16]'", "") if "td3" in new else SUITE
+    assert old in text
+    task = planned(home, text.replace(old, new, 1))["b"]
+    with pytest.raises(ChangedRow) as caught:
+        check_unchanged(task)
+    assert what in str(caught.value)
+    assert key in str(caught.value)
+    name = what.split()[1]
+    assert f"fresh=[{name}]" in str(caught.value)
+    check_unchanged(task, [name])
+
+
+def test_an_unchanged_row_passes_and_so_does_one_older_than_a_setting(home):
+    for task in planned(home).values():
+        check_unchanged(task)
+    task = planned(home)["b"]
+    path = task.folder / "task.json"
+    stored = json.loads(path.read_text())
+    del stored["settings"]["algorithm.tau"]
+    kept = path.read_text()
+    path.write_text(json.dumps(stored))
+    check_unchanged(task)
+    other = replace(task, train=replace(task.train, algorithm=replace(task.train.algorithm, tau=0.5)))
+    with pytest.raises(ChangedRow, match=r"algorithm\.tau = 0\.01, and now it is 0\.5"):
+        check_unchanged(other)
+    path.write_text(kept)
+
+
+def test_fresh_throws_away_what_it_names_and_nothing_else(tmp_path):
+    tasks = planned(tmp_path, SUITE.replace("{name: b, train: []}", "{name: greedy, policy: greedy}"))
+    for task in tasks.values():
+        execute(task)
+        clear(task, ["greedy"])
+    assert not tasks["greedy"].folder.exists()
+    assert finished(tasks["exact"])
+    clear(tasks["exact"], ["exact/kinematic"])
+    assert not finished(tasks["exact"])
+    assert list(tasks["exact"].folder.iterdir()) == []
+
+
+def test_an_evaluation_that_fails_does_not_stop_the_others(tmp_path):
+    text = SUITE.replace("{name: b, train: []}", "{name: greedy, policy: greedy}").replace(
+        'policy: "shielded:{run}"', "policy: nowhere/run, rows: [exact]"
+    )
+    text = text.replace("  - {name: kinematic", "  - {name: broken, policy: nowhere/run}\n  - {name: kinematic")
+    task = planned(tmp_path, text)["exact"]
+    with pytest.raises(IncompleteTask, match=r"broken: MissingFile: .*nowhere/run.*; shielded: MissingFile"):
+        execute(task)
+    assert read_record(task.folder / "kinematic.json")["episodes"] == 20
+    assert not finished(task)
+
+
+def test_settings_are_told_apart_by_what_they_are_not_by_where():
+    here, there = TrainConfig(out="a", progress=False), TrainConfig(out="b", resume="c")
+    assert settings_of(here) == settings_of(there) == usual_settings(here)
+    assert fingerprint(settings_of(here)) != fingerprint(settings_of(TrainConfig(seed=1)))
+    assert settings_of(here)["curriculum"] == [{"epsilon_low_deg": 0.7, "epsilon_high_deg": 12.0, "until_step": 0, "until_success": 1.0}]
+
+
+def test_a_record_that_is_not_whole_counts_as_none(tmp_path):
+    for text in ("", "{", "[1]"):
+        (tmp_path / "a.json").write_text(text)
+        assert read_record(tmp_path / "a.json") is None
+    assert read_record(tmp_path / "none.json") is None

@@ -1,0 +1,171 @@
+"""Suites: the shipped ones hold together and compose; what is wrong in a file is refused by entry and key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from marl_handover.commands import evaluate, train
+from marl_handover.compare.runs import BadRow, Grammar, plan_tasks
+from marl_handover.compare.suite import Suite, load_suite, suite_folder
+from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, UnknownChoice
+
+TRAIN, EVALUATE = Grammar(train.ALIASES, train.GROUPS), Grammar(evaluate.ALIASES, evaluate.GROUPS)
+SHIPPED = sorted(path.stem for path in suite_folder().glob("*.yaml"))
+
+MINIMAL = """
+title: T
+seeds: 3
+train: [steps=1000]
+rows:
+  - {name: a, train: [architecture=A], seeds: 2}
+  - {name: b, train: []}
+  - {name: exact, policy: exact, evaluate: [architecture=A]}
+evaluations:
+  - {name: kinematic, arguments: [episodes=10]}
+  - {name: shielded, policy: "shielded:{run}", seeds: 1}
+  - {name: chosen, arguments: [epsilon_deg=2], rows: [a]}
+quick: {seeds: 1, train: [steps=50], evaluate: {kinematic: [episodes=2]}}
+"""
+
+
+def written(tmp_path: Path, text: str) -> str:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    return str(path)
+
+
+@pytest.fixture
+def suite(tmp_path) -> Suite:
+    return load_suite(written(tmp_path, MINIMAL))
+
+
+def test_the_three_suites_are_shipped():
+    assert SHIPPED == ["ablations", "paper", "variants"]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("size", ["full", "quick"])
+def test_every_shipped_row_composes(name, size):
+    suite, refused = load_suite(name).sized(size), []
+    for row in suite.rows:
+        try:
+            tasks = plan_tasks(suite.with_rows([row.name]), Path("out"), TRAIN, EVALUATE)
+            assert [task.seed for task in tasks] == list(suite.seeds_of(row))
+            assert tasks[0].judgements
+        except BadRow as error:
+            refused.append(str(error))
+    assert not refused
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_suite_has_five_seeds_and_pictures_of_each_kind_it_names(name):
+    suite = load_suite(name)
+    assert suite.seeds == 5
+    assert {"evaluation", "milestones", "runs"} <= {table.kind for table in suite.tables}
+    assert {"curves", "bars"} <= {figure.kind for figure in suite.figures}
+
+
+def test_tasks_are_rows_by_seeds_with_arguments_from_weak_to_strong(suite):
+    tasks = plan_tasks(suite, Path("out"), TRAIN, EVALUATE)
+    assert [task.name for task in tasks] == [
+        "a/seed0",
+        "a/seed1",
+        "b/seed0",
+        "b/seed1",
+        "b/seed2",
+        "exact/seed0",
+        "exact/seed1",
+        "exact/seed2",
+    ]
+    first = tasks[0]
+    assert first.train is not None
+    assert (first.train.steps, first.train.task.architecture, first.train.seed) == (1000, "A", 0)
+    assert first.train.out == str(Path("out/a/seed0/run"))
+    assert [(j.name, j.config.policy, j.config.seed, j.config.episodes) for j in first.judgements] == [
+        ("kinematic", "out/a/seed0/run", 100, 10),
+        ("shielded", "shielded:out/a/seed0/run", 100, 1000),
+        ("chosen", "out/a/seed0/run", 100, 1000),
+    ]
+    assert [j.name for j in tasks[1].judgements] == ["kinematic", "chosen"]
+    untrained = tasks[-1]
+    assert untrained.train is None
+    assert [(j.name, j.config.policy, j.config.task.architecture, j.config.seed) for j in untrained.judgements] == [
+        ("kinematic", "exact", "A", 102)
+    ]
+
+
+def test_the_smoke_size_has_the_last_word(suite):
+    tasks = plan_tasks(suite.sized("quick"), Path("out"), TRAIN, EVALUATE)
+    assert [task.name for task in tasks] == ["a/seed0", "b/seed0", "exact/seed0"]
+    assert tasks[0].train is not None
+    assert tasks[0].train.steps == 50
+    assert tasks[0].judgements[0].config.episodes == 2
+    assert suite.sized("full") == suite
+
+
+def test_seeds_and_rows_from_the_command_line(suite):
+    more = suite.with_seeds(7)
+    assert [len(more.seeds_of(row)) for row in more.rows] == [7, 7, 7]
+    assert [row.name for row in suite.with_rows(["exact", "a"]).rows] == ["a", "exact"]
+    with pytest.raises(UnknownChoice, match="a, b, exact"):
+        suite.with_rows(["c"])
+    with pytest.raises(UnknownChoice, match="full, quick"):
+        suite.sized("small")
+    with pytest.raises(InvalidSetting, match="seeds"):
+        suite.with_seeds(0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("title: T", "titel: T", "unknown key 'titel'"),
+        ("{name: b, train: []}", "{name: b, trian: []}", r"rows\[1\] \(b\): unknown key 'trian'; keys: name"),
+        ("{name: b, train: []}", "{name: b, train: 3}", r"rows\[1\] \(b\)"),
+        ("{name: b, train: []}", "b", r"rows\[1\]: expected key: value"),
+        ("{name: b, train: []}", "{name: a, train: []}", "rows: a: the name is taken"),
+        ("{name: b, train: []}", "{name: ../b, train: []}", "small letters"),
+        ("{name: b, train: []}", "{name: b}", "give `train`"),
+        ("{name: b, train: []}", "{name: b, train: [], policy: exact}", "give `train`"),
+        ("{name: b, train: []}", "{name: b, policy: 'shielded:{run}'}", "is not trained"),
+        ("{name: b, train: []}", "{name: b, train: [], seeds: -1}", "seeds of b"),
+        ("rows: [a]", "rows: [z]", "'z' is not known; choose one of: a, b, exact"),
+        ("seeds: 1}\n", "rows: [exact]}\n", "row exact is not trained"),
+        ("{kinematic: [episodes=2]}", "{bullet: [episodes=2]}", "quick.evaluate = 'bullet'"),
+        ("quick: {seeds: 1", "quick: {seeds: 0", "quick.seeds"),
+        ("quick:", "figures: [{name: f, kind: pie}]\nquick:", "curves, bars"),
+        ("quick:", "figures: [{name: f, kind: curves, rows: [z]}]\nquick:", "figures: f: rows"),
+        ("quick:", "figures: [{name: f, kind: curves, measure: loss}]\nquick:", "figures: f: measure"),
+        ("quick:", "figures: [{name: f, kind: curves, x: days}]\nquick:", "figures: f: x"),
+        ("quick:", "figures: 3\nquick:", "figures: expected a list"),
+        ("quick:", "tables: [{name: t, kind: comparison, pairs: [[a]]}]\nquick:", "a pair has two rows"),
+        ("quick:", "tables: [{name: t, kind: comparison, pairs: [[a, z]]}]\nquick:", "tables: t: pairs"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, words):
+    assert old in MINIMAL
+    with pytest.raises(CorruptFile, match=words):
+        load_suite(written(tmp_path, MINIMAL.replace(old, new, 1)))
+
+
+def test_a_suite_needs_rows_and_a_file(tmp_path):
+    with pytest.raises(CorruptFile, match="number of rows"):
+        load_suite(written(tmp_path, "title: nothing"))
+    with pytest.raises(UnknownChoice, match="paper"):
+        load_suite("papper")
+    with pytest.raises(MissingFile):
+        load_suite(str(tmp_path / "none.yaml"))
+
+
+@pytest.mark.parametrize("argument", ["steps=0", "stepz=3", "architecture=C"])
+def test_bad_settings_are_told_with_their_row(tmp_path, argument):
+    suite = load_suite(written(tmp_path, MINIMAL.replace("train: []", f"train: ['{argument}']")))
+    with pytest.raises(BadRow, match="^row b: "):
+        plan_tasks(suite, Path("out"), TRAIN, EVALUATE)
+
+
+def test_bad_evaluation_settings_too(tmp_path):
+    suite = load_suite(written(tmp_path, MINIMAL.replace("epsilon_deg=2", "json=x")))
+    with pytest.raises(BadRow, match="row a: unknown key 'json"):
+        plan_tasks(suite, Path("out"), TRAIN, EVALUATE)

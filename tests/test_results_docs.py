@@ -1,0 +1,75 @@
+"""The page of results says what the stored results say, and nothing where there are none."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from marl_handover.compare.docs import blocks, filled, read_evidence
+from marl_handover.compare.suite import load_suite, suite_folder
+from marl_handover.compare.tables import make_tables, markdown
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+BLOCKS = blocks(PAGE)
+EVIDENCE = read_evidence(ROOT / "bench" / "results" / "compare")
+SUITES = sorted(path.stem for path in suite_folder().glob("*.yaml"))
+
+
+def test_the_page_has_a_block_for_every_table_and_figure_of_every_suite():
+    wanted = {
+        (kind, name, spec.name)
+        for name in SUITES
+        for kind, specs in (("table", load_suite(name).tables), ("figure", load_suite(name).figures))
+        for spec in specs
+    }
+    assert {(block.kind, block.suite, block.name) for block in BLOCKS} == wanted
+    assert len(BLOCKS) == len(wanted)
+
+
+def test_every_mark_is_closed():
+    assert len(re.findall(r"<!-- (?:table|figure):", PAGE)) == len(re.findall(r"<!-- end -->", PAGE)) == len(BLOCKS)
+
+
+@pytest.mark.parametrize("block", [block for block in BLOCKS if block.kind == "table"], ids=lambda block: f"{block.suite}/{block.name}")
+def test_a_table_is_the_stored_results_or_none(block):
+    if block.suite not in EVIDENCE:
+        assert "|" not in block.content, "numbers without evidence"
+        return
+    tables = {table.name: markdown(table) for table in make_tables(EVIDENCE[block.suite])}
+    assert block.content.strip() == tables[block.name].strip()
+
+
+@pytest.mark.parametrize("block", [block for block in BLOCKS if block.kind == "figure"], ids=lambda block: f"{block.suite}/{block.name}")
+def test_a_picture_is_there_or_not_promised(block):
+    shown = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", block.content)
+    assert len(shown) == (1 if block.suite in EVIDENCE else 0)
+    for path in shown:
+        assert (ROOT / "docs" / path).is_file()
+
+
+def test_no_table_of_numbers_stands_outside_the_blocks():
+    outside = PAGE
+    for block in BLOCKS:
+        outside = outside.replace(block.content, "")
+    assert not re.findall(r"^\|", outside, re.MULTILINE)
+    assert "![" not in outside
+
+
+def test_filling_the_page_again_changes_nothing():
+    assert filled(PAGE, EVIDENCE, "../bench/results/compare") == PAGE
+
+
+@pytest.mark.parametrize("suite", sorted(EVIDENCE))
+def test_evidence_names_settings_seeds_and_commits(suite):
+    found = EVIDENCE[suite]
+    assert (found["suite"], found["size"], found["missing"], found["failures"]) == (suite, "full", [], {})
+    for row in found["rows"]:
+        assert row["seeds"]
+        for run in row["runs"]:
+            parts = [*run["evaluations"].values(), *([run["trained"]] if row["settings"] else [])]
+            assert parts
+            assert all(part["commit"] != "none" and part["machine"]["cpu"] for part in parts)
+        assert (row["config_hash"] is None) == (row["settings"] is None)
