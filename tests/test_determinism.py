@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from marl_handover.compose import compose
-from marl_handover.learning.settings import ALGORITHMS, TrainConfig
+from marl_handover.learning.algorithm_settings import ALGORITHMS
+from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.trainer import Trainer
 
 SHORT = ("compile=off", "progress=false", "num_envs=16", "steps=640", "evaluation_interval=320", "evaluation_episodes=50")

@@ -15,7 +15,7 @@ from marl_handover.config import TaskConfig, require_at_least, require_positive
 from marl_handover.motion.cost import motion_cost
 from marl_handover.task.observations import observation_size, observe
 from marl_handover.task.problems import sample_problems
-from marl_handover.task.rules import Outcome, Rules
+from marl_handover.task.rules import Outcome, Rules, carried
 
 
 class SupervisorEnv(EnvBase):
@@ -104,7 +104,7 @@ class SupervisorEnv(EnvBase):
         pose, goal = sample_problems(self.rules.cell, fresh, self.generator, torch.float32)
         epsilon = self.draw_epsilon(fresh)
         previous = torch.full((fresh,), -1, device=self.device)
-        observation = observe(self.rules, self.rules.config.layout, pose, goal, previous, epsilon)
+        observation = self.observe(pose, goal, previous, epsilon)
         zero = torch.zeros(fresh, 1, dtype=torch.int64, device=self.device)
         new = {
             "observation": observation,
@@ -127,8 +127,20 @@ class SupervisorEnv(EnvBase):
         if not self.rules.noisy:
             return None
         noise = self.rules.config.noise
-        scale = torch.tensor([noise.position_mm, noise.position_mm, math.radians(noise.yaw_deg)], device=self.device)
-        return torch.randn(self.batch_size[0], 3, generator=self.generator, device=self.device) * scale
+        return self._normal(self.batch_size[0], noise.position_mm, noise.yaw_deg)
+
+    def _normal(self, count: int, position_mm: float, angle_deg: float) -> Tensor:
+        """Offsets (count, 3) of poses."""
+        scale = torch.tensor([position_mm, position_mm, math.radians(angle_deg)], device=self.device)
+        return torch.randn(count, 3, generator=self.generator, device=self.device) * scale
+
+    def observe(self, pose: Tensor, goal: Tensor, previous_arm: Tensor, epsilon_rad: Tensor) -> Tensor:
+        """What the supervisor sees of objects at ``pose`` (n, 3): displaced by noise, where the task has that."""
+        noise = self.rules.config.noise
+        if noise.observed:
+            offset = self._normal(len(pose), noise.observed_mm, noise.observed_deg)
+            pose = carried(pose, pose[:, :2] + offset[:, :2], offset[:, 2])
+        return observe(self.rules, self.rules.config.layout, pose, goal, previous_arm, epsilon_rad)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         pose, goal = tensordict["achieved_goal"], tensordict["desired_goal"]
@@ -148,7 +160,7 @@ class SupervisorEnv(EnvBase):
         terminated = result.terminated[:, None]
         truncated = (transfers >= limit) & ~terminated
         outcome = torch.where(truncated, int(Outcome.TIMEOUT), result.outcome[:, None])
-        observation = observe(self.rules, self.rules.config.layout, result.pose, goal, result.previous_arm, epsilon)
+        observation = self.observe(result.pose, goal, result.previous_arm, epsilon)
         return TensorDict(
             {
                 "observation": observation,

@@ -16,7 +16,9 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.learning.settings import AlgorithmConfig, TrainConfig
+from marl_handover.learning.algorithm_settings import AlgorithmConfig
+from marl_handover.learning.exploration import UniformActions
+from marl_handover.learning.settings import TrainConfig
 from marl_handover.task.rules import Rules
 
 logger = logging.getLogger(__name__)
@@ -36,6 +38,11 @@ class Algorithm(ABC):
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
         self.rules, self.config, self.generator = rules, config.algorithm, generator
         self.device = torch.device(config.device)
+        self.uniform = UniformActions(rules, config)
+
+    def blind(self, observation: Tensor) -> Tensor:
+        """Uniform actions (n, action_size), to start with."""
+        return self.uniform.draw(len(observation), self.generator)
 
     @abstractmethod
     def explore(self, observation: Tensor) -> Tensor:

@@ -13,20 +13,19 @@ from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate, TD3Loss
 
 from marl_handover.learning.algorithm import Algorithm
+from marl_handover.learning.algorithm_settings import BoxSacConfig, OffPolicyConfig, Td3Config
 from marl_handover.learning.networks import mlp
-from marl_handover.learning.settings import BoxSacConfig, OffPolicyConfig, Td3Config, TrainConfig
+from marl_handover.learning.settings import TrainConfig
 from marl_handover.task.observations import observation_size
 from marl_handover.task.rules import Rules
 
-ACTIONS = 4
-
 
 class StateActionValue(nn.Module):
-    """Q(observation, action) of one network: (n, size), (n, 4) -> (n, 1)."""
+    """Q(observation, action) of one network: (n, size), (n, actions) -> (n, 1)."""
 
-    def __init__(self, inputs: int, hidden: list[int]) -> None:
+    def __init__(self, inputs: int, hidden: list[int], actions: int) -> None:
         super().__init__()
-        self.net = mlp(inputs + ACTIONS, hidden, 1)
+        self.net = mlp(inputs + actions, hidden, 1)
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         """Values of a batch."""
@@ -53,13 +52,13 @@ class BoxAlgorithm(Algorithm):
         return {"loss": self.loss, "actor_optimizer": self.actor_optimizer, "value_optimizer": self.value_optimizer}
 
     def actor(self) -> nn.Module:
-        """The network from observation to action parameters; its first four outputs are the mean before the tanh."""
+        """The network from observation to action parameters; its first outputs are the mean before the tanh."""
         return self.net
 
     @torch.no_grad()
     def act(self, observation: Tensor) -> Tensor:
         """The mean action."""
-        return self.net(observation)[..., :ACTIONS].tanh()
+        return self.net(observation)[..., : self.rules.action_size].tanh()
 
     def _scaled(self, batch: TensorDictBase) -> TensorDictBase:
         """The batch with rewards times ``reward_scale``."""
@@ -77,10 +76,12 @@ class BoxSac(BoxAlgorithm):
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
         super().__init__(rules, config, generator)
         inputs = observation_size(rules.config.layout)
-        self.net = mlp(inputs, self.config.hidden, 2 * ACTIONS).to(self.device)
-        self.policy = gaussian_policy(self.net, self.device)
-        value = ValueOperator(StateActionValue(inputs, self.config.hidden).to(self.device), in_keys=["observation", "action"])
-        loss = SACLoss(self.policy, value, num_qvalue_nets=2, loss_function="l2", action_spec=box_spec(self.device))
+        self.net = mlp(inputs, self.config.hidden, 2 * rules.action_size).to(self.device)
+        self.policy = gaussian_policy(self.net, rules.action_size, self.device)
+        network = StateActionValue(inputs, self.config.hidden, rules.action_size).to(self.device)
+        value = ValueOperator(network, in_keys=["observation", "action"])
+        spec = box_spec(rules.action_size, self.device)
+        loss = SACLoss(self.policy, value, num_qvalue_nets=2, loss_function="l2", action_spec=spec)
         self._finish(
             loss, list(loss.actor_network_params.flatten_keys().values()), list(loss.qvalue_network_params.flatten_keys().values())
         )
@@ -124,12 +125,12 @@ class Td3(BoxAlgorithm):
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
         super().__init__(rules, config, generator)
         inputs = observation_size(rules.config.layout)
-        self.net = mlp(inputs, self.config.hidden, ACTIONS).to(self.device)
+        self.net = mlp(inputs, self.config.hidden, rules.action_size).to(self.device)
         policy = TensorDictModule(nn.Sequential(self.net, nn.Tanh()), in_keys=["observation"], out_keys=["action"])
-        value = ValueOperator(StateActionValue(inputs, self.config.hidden).to(self.device), in_keys=["observation", "action"])
-        loss = TD3Loss(
-            policy, value, num_qvalue_nets=2, loss_function="l2", action_spec=box_spec(self.device), policy_noise=self.config.target_noise
-        )
+        network = StateActionValue(inputs, self.config.hidden, rules.action_size).to(self.device)
+        value = ValueOperator(network, in_keys=["observation", "action"])
+        spec = box_spec(rules.action_size, self.device)
+        loss = TD3Loss(policy, value, num_qvalue_nets=2, loss_function="l2", action_spec=spec, policy_noise=self.config.target_noise)
         self._finish(
             loss, list(loss.actor_network_params.flatten_keys().values()), list(loss.qvalue_network_params.flatten_keys().values())
         )
@@ -149,7 +150,7 @@ class Td3(BoxAlgorithm):
         """The policy's action with Gaussian noise, or a uniform one."""
         action = self.act(observation)
         noise = torch.randn(action.shape, generator=self.generator, device=self.device) * self.config.exploration_std
-        uniform = torch.rand(action.shape, generator=self.generator, device=self.device) * 2 - 1
+        uniform = self.blind(observation)
         blind = torch.rand(len(action), 1, generator=self.generator, device=self.device) < self.config.random_action
         return torch.where(blind, uniform, (action + noise).clamp(-1, 1))
 
@@ -167,13 +168,13 @@ class Td3(BoxAlgorithm):
         return {"loss_critic": losses["loss_qvalue"].detach(), "loss_actor": losses["loss_actor"].detach()}
 
 
-def gaussian_policy(net: nn.Module, device: torch.device) -> ProbabilisticActor:
-    """Tanh-Gaussian policy of a network (n, size) -> (n, 8): four means, four raw scales."""
+def gaussian_policy(net: nn.Module, actions: int, device: torch.device) -> ProbabilisticActor:
+    """Tanh-Gaussian policy of a network (n, size) -> (n, 2 * actions): means, then raw scales."""
     parameters = TensorDictModule(nn.Sequential(net, NormalParamExtractor()), in_keys=["observation"], out_keys=["loc", "scale"])
-    keys = ["loc", "scale"]
-    return ProbabilisticActor(parameters, in_keys=keys, distribution_class=TanhNormal, return_log_prob=True, spec=box_spec(device))
+    spec = box_spec(actions, device)
+    return ProbabilisticActor(parameters, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True, spec=spec)
 
 
-def box_spec(device: torch.device) -> Bounded:
+def box_spec(actions: int, device: torch.device) -> Bounded:
     """The action space of one cell."""
-    return Bounded(-1.0, 1.0, shape=(ACTIONS,), device=device)
+    return Bounded(-1.0, 1.0, shape=(actions,), device=device)

@@ -19,7 +19,7 @@ from marl_handover.errors import CorruptFile, MissingFile, NotFinite, OutOfReach
 from marl_handover.learning.rollout import Act, Episodes, Noise, Observer, play
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
-from marl_handover.task.rules import Outcome, Rules
+from marl_handover.task.rules import Outcome, Rules, carried
 
 Floats = NDArray[np.float64]
 
@@ -118,6 +118,7 @@ def evaluate(
     seed: int = 0,
     observer: Observer | None = None,
     progress: Callable[[int], object] = lambda done: None,
+    timed: Act | None = None,
 ) -> Evaluation:
     """Play all problems (n, 3), (n, 3) with a batched numpy policy, in chunks, and time single decisions.
 
@@ -125,21 +126,22 @@ def evaluate(
         rules: the rule book to be judged by.
         act: the policy.
         problems: starts and goals.
-        seed: of execution noise.
+        seed: of noise.
         observer: sees every decision, with episode numbers over all problems.
         progress: called with the number of problems a chunk finished.
+        timed: what is timed instead of ``act``, for one that counts its decisions.
     """
     started = time.perf_counter()
-    noise = placement_noise(rules, seed)
+    noise, seeing = placement_noise(rules, seed), mistaken(rules, act, seed)
     parts = []
     for first in range(0, len(problems[0]), CHUNK):
         start, goal = problems[0][first : first + CHUNK], problems[1][first : first + CHUNK]
         shifted = None if observer is None else _shifted(observer, first)
-        parts.append(play(rules, act, start, goal, noise=noise, observer=shifted))
+        parts.append(play(rules, seeing, start, goal, noise=noise, observer=shifted))
         progress(len(start))
     episodes = Episodes(*(np.concatenate([part[index] for part in parts]) for index in range(3)))
     optimal = ExactPlanner(rules).plan(*problems).transfers
-    return Evaluation(episodes, optimal, decision_time(act, problems), time.perf_counter() - started)
+    return Evaluation(episodes, optimal, decision_time(timed or act, problems), time.perf_counter() - started)
 
 
 def _shifted(observer: Observer, first: int) -> Observer:
@@ -154,6 +156,22 @@ def placement_noise(rules: Rules, seed: int) -> Noise | None:
     scale = np.array([settings.position_mm, settings.position_mm, math.radians(settings.yaw_deg)])
     generator = np.random.default_rng(seed)
     return lambda count: generator.normal(size=(count, 3)) * scale
+
+
+def mistaken(rules: Rules, act: Act, seed: int) -> Act:
+    """``act`` as it decides about an object that it sees displaced, as the task's settings say; or itself."""
+    settings = rules.config.noise
+    if not settings.observed:
+        return act
+    scale = np.array([settings.observed_mm, settings.observed_mm, math.radians(settings.observed_deg)])
+    generator = np.random.default_rng([seed, 1])  # other draws than those of placements
+
+    def seeing(pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        offset = generator.normal(size=pose.shape) * scale
+        seen: Floats = act(carried(pose, pose[..., :2] + offset[..., :2], offset[..., 2]), goal, previous_arm)
+        return seen
+
+    return seeing
 
 
 def decision_time(act: Act, problems: tuple[Floats, Floats]) -> tuple[float, float]:

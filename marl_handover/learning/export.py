@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from marl_handover.cell import load_cell
 from marl_handover.errors import CorruptFile
 from marl_handover.learning.algorithm import Algorithm
+from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.checkpoint import FILE, load_checkpoint
-from marl_handover.learning.settings import ALGORITHMS, TrainConfig
+from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.variants import make_variant
 
 Arrays = dict[str, NDArray[Any]]

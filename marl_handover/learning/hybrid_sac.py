@@ -17,8 +17,9 @@ from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from marl_handover.learning.algorithm import Algorithm, compiled
+from marl_handover.learning.algorithm_settings import SacConfig
 from marl_handover.learning.networks import AfterstateCritic, HybridActor, arm_blocks, chosen_action, squashed_sample
-from marl_handover.learning.settings import SacConfig, TrainConfig
+from marl_handover.learning.settings import TrainConfig
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Command, Rules
 
@@ -239,7 +240,7 @@ class HybridSac(Algorithm):
         gumbel = -(-uniform.clamp_min(1e-20).log()).log()
         blind = torch.rand(place.shape[:-1], generator=self.generator, device=self.device) < self.config.random_place
         blind &= curious[:, None, None]
-        place = torch.where(blind[..., None], self._anywhere(place.shape), place)
+        place = torch.where(blind[..., None], self.uniform.spread(self._anywhere(place.shape)), place)
         return chosen_action(branches.logits, place, gumbel * curious[:, None])
 
     @torch.no_grad()

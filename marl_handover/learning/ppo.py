@@ -10,9 +10,10 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from marl_handover.learning.algorithm import Algorithm
-from marl_handover.learning.box import ACTIONS, gaussian_policy
+from marl_handover.learning.algorithm_settings import PpoConfig
+from marl_handover.learning.box import gaussian_policy
 from marl_handover.learning.networks import mlp
-from marl_handover.learning.settings import PpoConfig, TrainConfig
+from marl_handover.learning.settings import TrainConfig
 from marl_handover.task.observations import observation_size
 from marl_handover.task.rules import Rules
 
@@ -26,8 +27,8 @@ class Ppo(Algorithm):
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
         super().__init__(rules, config, generator)
         inputs = observation_size(rules.config.layout)
-        self.net = mlp(inputs, self.config.hidden, 2 * ACTIONS).to(self.device)
-        self.policy = gaussian_policy(self.net, self.device)
+        self.net = mlp(inputs, self.config.hidden, 2 * rules.action_size).to(self.device)
+        self.policy = gaussian_policy(self.net, rules.action_size, self.device)
         value = ValueOperator(mlp(inputs, self.config.hidden, 1).to(self.device), in_keys=["observation"])
         self.loss = ClipPPOLoss(
             self.policy,
@@ -45,7 +46,7 @@ class Ppo(Algorithm):
         return {"loss": self.loss, "optimizer": self.optimizer}
 
     def actor(self) -> nn.Module:
-        """The network from observation to action parameters; its first four outputs are the mean before the tanh."""
+        """The network from observation to action parameters; its first outputs are the mean before the tanh."""
         return self.net
 
     @torch.no_grad()
@@ -59,7 +60,7 @@ class Ppo(Algorithm):
     @torch.no_grad()
     def act(self, observation: Tensor) -> Tensor:
         """The mean action."""
-        return self.net(observation)[..., :ACTIONS].tanh()
+        return self.net(observation)[..., : self.rules.action_size].tanh()
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """``epochs`` passes over the roll-out in minibatches. Each pass counts as one gradient step a minibatch."""

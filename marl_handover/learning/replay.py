@@ -19,7 +19,6 @@ from marl_handover.arrays import one_where, wrap
 from marl_handover.cell.symmetry import GROUP
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.settings import ReplayConfig
-from marl_handover.task.observations import observe
 from marl_handover.task.rules import Rules
 
 STORED = ("achieved_goal", "desired_goal", "previous_arm", "action", "placed", "feasible", "epsilon", "terminated")
@@ -194,14 +193,14 @@ class HindsightReplayBuffer(HERReplayBuffer):
 
     def _assembled(self, batch: TensorDictBase, reward: Tensor, terminated: Tensor) -> TensorDict:
         arm = self.rules.decode(batch["action"]).arm
-        layout, epsilon = self.rules.config.layout, batch["epsilon"][:, 0]
+        epsilon = batch["epsilon"][:, 0]
         previous = batch["previous_arm"][:, 0]
         after = torch.where(batch["feasible"][:, 0], arm, previous)
         goal, pose, placed = batch["desired_goal"], batch["achieved_goal"], batch["placed"]
         final = torch.where(batch["final"], 1.0, -1.0)
         action = torch.cat([final[:, None], batch["action"][:, 1:]], -1) if not self.rules.external_finish else batch["action"]
         following = {
-            "observation": observe(self.rules, layout, placed, goal, after, epsilon),
+            "observation": self.env.observe(placed, goal, after, epsilon),
             "achieved_goal": placed,
             "previous_arm": after[:, None],
             "reward": reward,
@@ -210,7 +209,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
         }
         return TensorDict(
             {
-                "observation": observe(self.rules, layout, pose, goal, previous, epsilon),
+                "observation": self.env.observe(pose, goal, previous, epsilon),
                 "achieved_goal": pose,
                 "desired_goal": goal,
                 "epsilon": batch["epsilon"],

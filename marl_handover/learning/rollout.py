@@ -9,7 +9,7 @@ from marl_handover.arrays import Array, namespace
 from marl_handover.task.rules import Outcome, Rules, Transition
 
 Act = Callable[[Array, Array, Array], Array]
-"""pose (n, 3), goal (n, 3), previous_arm (n,) -> action (n, 4)."""
+"""pose (n, 3), goal (n, 3), previous_arm (n,) -> action (n, 4); a row that is not a number: no arm moves."""
 
 Noise = Callable[[int], Array]
 """Number of cells -> placement noise (n, 3)."""
@@ -49,7 +49,10 @@ def play(
     noise: Noise | None = None,
     observer: Observer | None = None,
 ) -> Episodes:
-    """Play every problem, pose and goal (n, 3), to its end. Only running episodes are computed."""
+    """Play every problem, pose and goal (n, 3), to its end. Only running episodes are computed.
+
+    Where no arm is to move, a policy that says the same of the same object will never move one: a time-out at once, without a transfer.
+    """
     xp = namespace(pose)
     count, limit = len(pose), rules.config.max_steps
     zero = xp.zeros_like(pose[:, 0])
@@ -72,6 +75,7 @@ def play(
             noise=None if noise is None else noise(len(here)),
             final_noise=None if noise is None else noise(len(here)),
         )
+        result = _without_idle(result, action)
         if observer is not None:
             observer(Decision(running, here, there, previous, made, result))
         total = made + result.transfers
@@ -82,6 +86,20 @@ def play(
         going = ~over
         running, pose, goal, previous = running[going], result.pose[going], there[going], result.previous_arm[going]
     return Episodes(outcome, transfers, ended)
+
+
+def _without_idle(result: Transition, action: Array) -> Transition:
+    """The result of a decision, with a time-out where no arm was to move (and, in architecture A, none moved by itself)."""
+    xp = namespace(action)
+    idle = xp.isnan(action).any(-1) & (result.external_arm < 0)
+    if not bool(idle.any()):
+        return result
+    return result._replace(
+        transfers=xp.where(idle, 0, result.transfers),
+        reward=xp.where(idle, 0 * result.reward, result.reward),
+        terminated=result.terminated | idle,
+        outcome=xp.where(idle, int(Outcome.TIMEOUT), result.outcome),
+    )
 
 
 def _put(array: Array, index: Array, values: Array) -> Array:

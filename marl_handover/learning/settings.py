@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from marl_handover.config import (
     HINDSIGHT,
     CellConfig,
+    CentralisedConfig,
+    DecentralisedConfig,
     TaskConfig,
     require_at_least,
     require_between,
@@ -15,6 +17,7 @@ from marl_handover.config import (
     require_seed,
 )
 from marl_handover.errors import InvalidSetting
+from marl_handover.learning.algorithm_settings import AlgorithmConfig, OffPolicyConfig, SacConfig
 
 
 @dataclass
@@ -48,144 +51,11 @@ class StageConfig:
     until_success: float = 1.0  # a success rate in evaluation that ends it earlier; 1 = never
 
 
-@dataclass
-class AlgorithmConfig:
-    """What every algorithm has."""
-
-    name: str = ""
-    layout: str = "relative"  # observation layout
-    learning_rate: float = 1e-3
-    decay_from: float = 0.5  # fraction of training after which the learning rate falls linearly to zero
-    gamma: float = 0.95
-    reward_scale: float = 0.5
-    batch_size: int = 256
-
-    def validate(self) -> None:
-        """Raise :class:`InvalidSetting` on a value out of its limits."""
-        for name in ("learning_rate", "gamma", "reward_scale", "batch_size"):
-            require_positive(f"algorithm.{name}", getattr(self, name))
-        for name in ("gamma", "decay_from"):
-            require_between(f"algorithm.{name}", getattr(self, name), 0, 1)
-        for name in ("hidden", "actor_hidden", "critic_hidden", "final_hidden"):
-            for width in getattr(self, name, []):
-                require_at_least(f"algorithm.{name}", width, 1)
-        if self.layout == "object":
-            raise InvalidSetting("algorithm.layout", self.layout, "'raw' or 'relative'; 'object' hides the goal")
-
-
-@dataclass
-class OffPolicyConfig(AlgorithmConfig):
-    """What every algorithm with a replay memory has."""
-
-    learning_starts: int = 1000  # environment steps with uniform actions, before the first update
-    steps_per_update: float = 8.0  # environment steps for each gradient step
-    tau: float = 0.01  # target smoothing
-
-    def validate(self) -> None:
-        """As the base class, and the replay's pace."""
-        super().validate()
-        require_positive("algorithm.steps_per_update", self.steps_per_update)
-        require_at_least("algorithm.learning_starts", self.learning_starts, 0)
-        require_between("algorithm.tau", self.tau, 0, 1)
-
-
-@dataclass
-class SacConfig(OffPolicyConfig):
-    """Hybrid SAC: exact expectation over (arm, final, place mode), tanh-Gaussian places, two temperatures."""
-
-    name: str = "sac"
-    actor_hidden: list[int] = field(default_factory=lambda: [128, 128])
-    critic_hidden: list[int] = field(default_factory=lambda: [128, 128])
-    final_hidden: list[int] = field(default_factory=lambda: [64, 64])  # of the critic of finishing
-    modes: int = 1  # place distributions an arm, chosen between like the other discrete branches
-    canonical: bool = True  # fold the mirror symmetry M_x into the networks
-    harmonics: int = 2  # doublings of the angles that the networks see
-    candidates: int = 3  # places an arm tried anywhere, and as many nearby; the actor's mean is drawn to the nearest clearly better one
-    candidate_share: float = 0.5  # of the batch
-    candidate_weight: float = 1.0
-    candidate_margin: float = 0.25  # in units of scaled reward
-    greedy_share: float = 0.25  # of the cells, which act without noise
-    random_place: float = 0.1  # share of exploration's places that are drawn anywhere
-    place_entropy_start: float = -2.0  # target entropies fall from start (linearly / geometrically) ...
-    place_entropy_end: float = -5.0
-    branch_entropy_start: float = 0.1
-    branch_entropy_end: float = 0.01
-    entropy_until: float = 0.75  # ... to end at this fraction of training
-    temperature_rate: float = 3e-3
-    initial_temperature: float = 0.1
-
-    def validate(self) -> None:
-        """As the base class, and what only this algorithm has."""
-        super().validate()
-        require_at_least("algorithm.modes", self.modes, 1)
-        for name in ("harmonics", "candidates", "candidate_weight"):
-            require_at_least(f"algorithm.{name}", getattr(self, name), 0)
-        for name in ("candidate_share", "greedy_share", "random_place"):
-            require_between(f"algorithm.{name}", getattr(self, name), 0, 1)
-        for name in ("branch_entropy_start", "branch_entropy_end", "entropy_until", "temperature_rate", "initial_temperature"):
-            require_positive(f"algorithm.{name}", getattr(self, name))
-
-
-@dataclass
-class BoxSacConfig(OffPolicyConfig):
-    """SAC with all four action numbers in one squashed Gaussian, thresholded by the environment, as in the paper."""
-
-    name: str = "box_sac"
-    learning_rate: float = 5e-4
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
-
-
-@dataclass
-class Td3Config(OffPolicyConfig):
-    """TD3 on the boxed action."""
-
-    name: str = "td3"
-    learning_rate: float = 5e-4
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
-    policy_delay: int = 2
-    exploration_std: float = 0.3
-    random_action: float = 0.2  # share of exploration actions drawn uniformly
-    target_noise: float = 0.1
-
-    def validate(self) -> None:
-        """As the base class, and what only this algorithm has."""
-        super().validate()
-        require_at_least("algorithm.policy_delay", self.policy_delay, 1)
-        require_between("algorithm.random_action", self.random_action, 0, 1)
-        for name in ("exploration_std", "target_noise"):
-            require_at_least(f"algorithm.{name}", getattr(self, name), 0)
-
-
-@dataclass
-class PpoConfig(AlgorithmConfig):
-    """PPO with a clipped objective on the boxed action; on-policy, so no replay and no hindsight."""
-
-    name: str = "ppo"
-    learning_rate: float = 5e-4
-    batch_size: int = 512
-    rollout_steps: int = 32  # environment steps a cell between updates
-    epochs: int = 4
-    gae_lambda: float = 0.95
-    clip: float = 0.2
-    entropy: float = 0.003
-    max_grad_norm: float = 0.5
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
-
-    def validate(self) -> None:
-        """As the base class, and what only this algorithm has."""
-        super().validate()
-        for name in ("rollout_steps", "epochs"):
-            require_at_least(f"algorithm.{name}", getattr(self, name), 1)
-        for name in ("clip", "max_grad_norm"):
-            require_positive(f"algorithm.{name}", getattr(self, name))
-        require_between("algorithm.gae_lambda", self.gae_lambda, 0, 1)
-        require_at_least("algorithm.entropy", self.entropy, 0)
-
-
 VARIANTS = ("hierarchical", "centralised", "decentralised")
 SOURCES = ("batched", "aec")
+BACKENDS = ("kinematic", "noisy", "bullet")
+EXECUTORS = ("direct", "optimised")
 COLLECTORS = ("local", "multiprocess", "ray")
-ALGORITHMS: dict[str, type[AlgorithmConfig]] = {"sac": SacConfig, "box_sac": BoxSacConfig, "td3": Td3Config, "ppo": PpoConfig}
 
 
 @dataclass
@@ -198,8 +68,13 @@ class TrainConfig:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     curriculum: list[StageConfig] = field(default_factory=lambda: [StageConfig(0.7, 12.0)])
     variant: str = "hierarchical"  # hierarchical, centralised or decentralised
+    centralised: CentralisedConfig = field(default_factory=CentralisedConfig)
+    decentralised: DecentralisedConfig = field(default_factory=DecentralisedConfig)
     source: str = "batched"  # of transitions: batched (the rule book itself), or aec (the PettingZoo environment, executors and all)
     backend: str = "kinematic"  # of source=aec: kinematic, noisy or bullet
+    executor: str = (
+        "direct"  # of source=aec: how arms move: direct (straight in joint space, through anything), or optimised (collision-free)
+    )
     collector: str = "local"  # of source=aec: local, multiprocess or ray
     workers: int = 2  # of collector=multiprocess and ray
     steps: int = 48_000  # commanded transfers, over all cells
@@ -220,9 +95,14 @@ class TrainConfig:
         if self.task.layout not in (TaskConfig().layout, self.algorithm.layout):
             raise InvalidSetting("task.layout", self.task.layout, "left alone in training; the learner's layout is algorithm.layout")
         self.task.layout = self.algorithm.layout
+        if self.task.previous_arm not in (TaskConfig().previous_arm, self.algorithm.previous_arm):
+            raise InvalidSetting("task.previous_arm", self.task.previous_arm, "left alone in training; use algorithm.previous_arm")
+        self.task.previous_arm = self.algorithm.previous_arm
         self.task.validate()
         require_choice("variant", self.variant, VARIANTS)
         require_choice("source", self.source, SOURCES)
+        require_choice("backend", self.backend, BACKENDS)
+        require_choice("executor", self.executor, EXECUTORS)
         require_choice("collector", self.collector, COLLECTORS)
         require_choice("compile", self.compile, ("auto", "on", "off"))
         require_choice("replay.hindsight.strategy", self.replay.hindsight.strategy, HINDSIGHT)
@@ -239,3 +119,51 @@ class TrainConfig:
             require_at_least(f"curriculum[{index}].epsilon_high_deg", stage.epsilon_high_deg, stage.epsilon_low_deg)
         require_seed(self.seed)
         self.algorithm.validate()
+        self.centralised.validate()
+        if self.variant == "centralised":
+            self._validate_centralised()
+        self.decentralised.validate()
+        if self.variant == "decentralised":
+            self._validate_decentralised()
+        self._validate_source()
+
+    def _validate_centralised(self) -> None:
+        """What that variant cannot do."""
+        limits = (
+            ("task.architecture", self.task.architecture, "B", "whose policy moves the last time too"),
+            ("task.reward.motion_weight", self.task.reward.motion_weight, 0.0, "whose paths have no price"),
+            ("replay.symmetry", self.replay.symmetry, False, "whose networks fold the symmetry"),
+        )
+        for name, value, only, reason in limits:
+            if value != only:
+                raise InvalidSetting(name, value, f"{only} with variant=centralised, {reason}")
+
+    def _validate_decentralised(self) -> None:
+        """What that variant cannot do, or does not need."""
+        self.decentralised.validate_task(self.task)
+        limits = (("source", self.source, "batched"), ("replay.correct_terminated", self.replay.correct_terminated, True))
+        for name, value, only in limits:
+            if value != only:
+                raise InvalidSetting(name, value, f"{only} with variant=decentralised")
+        decisions = self.decentralised.decisions_per_transfer * self.task.max_steps
+        require_at_least("replay.capacity", self.replay.capacity, decisions * self.num_envs)
+        if self.decentralised.learners == "independent" and self.algorithm.batch_size % 2:
+            raise InvalidSetting("algorithm.batch_size", self.algorithm.batch_size, "even, half for each of two independent learners")
+
+    def _validate_source(self) -> None:
+        """What the AEC environment cannot do, and what nothing else does."""
+        if self.source == "batched":
+            usual = TrainConfig()
+            for name in ("backend", "executor", "collector"):
+                if getattr(self, name) != getattr(usual, name):
+                    raise InvalidSetting(name, getattr(self, name), f"{getattr(usual, name)}, unless source=aec")
+            return
+        if self.variant != "hierarchical":
+            raise InvalidSetting("source", self.source, f"batched with variant={self.variant}")
+        if not isinstance(self.algorithm, OffPolicyConfig):
+            raise InvalidSetting("source", self.source, f"batched with algorithm={self.algorithm.name}, which has no replay memory")
+        noise = self.task.noise
+        if noise.observed or (self.backend != "noisy" and (noise.position_mm > 0 or noise.yaw_deg > 0)):
+            raise InvalidSetting("task.noise", noise, "none with source=aec, but for that of placements with backend=noisy")
+        if self.backend == "bullet" and self.executor == "direct":
+            raise InvalidSetting("executor", self.executor, "optimised with backend=bullet, where arms touch things")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,12 @@ from torch import Tensor
 
 from marl_handover.compose import to_yaml
 from marl_handover.errors import CheckpointMismatch, CorruptFile, InvalidSetting
+from marl_handover.learning.algorithm_settings import OffPolicyConfig, PpoConfig
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
 from marl_handover.learning.curriculum import Curriculum
 from marl_handover.learning.experience import Collected
 from marl_handover.learning.recorder import Recorder, write_whole
-from marl_handover.learning.settings import OffPolicyConfig, PpoConfig, TrainConfig
+from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.variants import make_variant
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
@@ -32,6 +33,12 @@ VALIDATION_SEED = 2_000_000_000
 
 STEPS_WEIGHT = 0.05
 """Of two policies the better has the higher success rate; 1 % more steps than the optimum weigh as much as 0.05 % less success."""
+
+
+def validation_score(row: Mapping[str, float]) -> float:
+    """How good a policy is, from its ``success_rate`` and ``steps_ratio`` (NaN without a success) on the validation problems."""
+    excess = 0.0 if math.isnan(row["steps_ratio"]) else row["steps_ratio"] - 1.0
+    return row["success_rate"] - STEPS_WEIGHT * excess
 
 
 @dataclass
@@ -99,7 +106,7 @@ class Trainer:
         """Collect, and make the gradient steps that are due."""
         config = self.config.algorithm
         blind = isinstance(config, OffPolicyConfig) and self.counters.step < config.learning_starts
-        collected = self.experience.collect(self._blind if blind else self.algorithm.explore)
+        collected = self.experience.collect(self.algorithm.blind if blind else self.algorithm.explore)
         self.counters.step += collected.steps
         self.recent += collected.ended
         self.counters.episodes += int(collected.ended[0])
@@ -109,11 +116,6 @@ class Trainer:
         elif isinstance(config, PpoConfig):
             assert collected.transition is not None
             self._learn_from_rollout(collected.transition, config)
-
-    def _blind(self, observation: Tensor) -> Tensor:
-        """Uniform actions."""
-        shape = (len(observation), self.rules.action_size)
-        return torch.rand(shape, generator=self.generator, device=self.device) * 2 - 1
 
     def _learn_from_replay(self, collected: Collected, config: OffPolicyConfig) -> None:
         if collected.rows is not None:
@@ -158,8 +160,7 @@ class Trainer:
     def _keep_best(self) -> None:
         """Remember the actor if none did better; policies of a run are read from this one."""
         final_stage = self.counters.stage == len(self.config.curriculum) - 1
-        excess = 0.0 if math.isnan(self.last["steps_ratio"]) else self.last["steps_ratio"] - 1.0
-        score = self.last["success_rate"] - STEPS_WEIGHT * excess
+        score = validation_score(self.last)
         # Before the last stage, always the present one: scores at another epsilon do not compare.
         if not (final_stage and self.best and score < self.best["score"]):
             actor = {name: value.detach().clone() for name, value in self.algorithm.actor().state_dict().items()}

@@ -13,16 +13,19 @@ from torch import Tensor
 
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import TaskConfig
+from marl_handover.envs.handover_aec import HandoverEnv
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.errors import InvalidSetting, UnknownChoice
 from marl_handover.learning.algorithm import Algorithm
+from marl_handover.learning.algorithm_settings import ALGORITHMS, OffPolicyConfig
 from marl_handover.learning.box import BoxSac, Td3
+from marl_handover.learning.dqn import Dqn
 from marl_handover.learning.experience import BatchedExperience, Experience
 from marl_handover.learning.hybrid_sac import HybridSac
 from marl_handover.learning.ppo import Ppo
 from marl_handover.learning.replay import HindsightReplayBuffer
 from marl_handover.learning.rollout import Episodes, play
-from marl_handover.learning.settings import ALGORITHMS, VARIANTS, OffPolicyConfig, TrainConfig
+from marl_handover.learning.settings import VARIANTS, TrainConfig
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Rules
 
@@ -30,7 +33,7 @@ from marl_handover.task.rules import Rules
 class Variant:
     """The hierarchical formulation, and the base of the others."""
 
-    algorithms: ClassVar[dict[str, type[Algorithm]]] = {"sac": HybridSac, "box_sac": BoxSac, "td3": Td3, "ppo": Ppo}
+    algorithms: ClassVar[dict[str, type[Algorithm]]] = {"sac": HybridSac, "box_sac": BoxSac, "td3": Td3, "ppo": Ppo, "dqn": Dqn}
 
     def rules(self, cell: Cell, task: TaskConfig, config: TrainConfig) -> Rules:
         """The rule book that actions are judged by; prices of motions are the environment's matter."""
@@ -38,10 +41,17 @@ class Variant:
 
     def env(self, config: TrainConfig, device: torch.device) -> SupervisorEnv:
         """The batch of cells to train in."""
-        return SupervisorEnv(config.num_envs, load_cell(config.cell), config.task, device, seed=config.seed + 1)
+        rules = None
+        if config.source == "aec" and config.backend != "kinematic":
+            # Arms that are not exact keep to a part of the chart and are judged by what is measured; all of them alike.
+            rules = HandoverEnv(backend="noisy", cell=config.cell, task=config.task).rules
+        return SupervisorEnv(config.num_envs, load_cell(config.cell), config.task, device, seed=config.seed + 1, rules=rules)
 
     def experience(self, env: SupervisorEnv, config: TrainConfig) -> Experience:
         """Where transitions come from."""
+        if config.source == "aec":
+            aec: type[Experience] = importlib.import_module("marl_handover.learning.aec_experience").AecExperience
+            return aec(env, config)  # type: ignore[call-arg]
         return BatchedExperience(env, isinstance(config.algorithm, OffPolicyConfig))
 
     def replay(self, env: SupervisorEnv, config: TrainConfig, generator: torch.Generator) -> HindsightReplayBuffer:

@@ -5,6 +5,7 @@ from marl_handover.policies.files import read_policy, stored_settings
 from marl_handover.policies.network import NetworkPolicy
 from marl_handover.policies.policy import SupervisorPolicy
 from marl_handover.policies.registry import NAMES, adapted, load
+from marl_handover.policies.shielded import ShieldedPolicy
 
 __all__ = [
     "NAMES",
@@ -12,6 +13,7 @@ __all__ = [
     "GreedyPolicy",
     "NetworkPolicy",
     "RandomPolicy",
+    "ShieldedPolicy",
     "SupervisorPolicy",
     "adapted",
     "load",

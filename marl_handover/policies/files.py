@@ -17,6 +17,10 @@ from marl_handover.task.observations import observation_size
 KINDS = {
     "hybrid": "marl_handover.policies.network:NetworkPolicy",
     "box": "marl_handover.policies.network:NetworkPolicy",
+    "centralised": "marl_handover.policies.centralised:CentralisedPolicy",
+    "centralised_box": "marl_handover.policies.centralised:CentralisedPolicy",
+    "discrete": "marl_handover.policies.discrete:DiscretePolicy",
+    "turns": "marl_handover.policies.decentralised:TurnsPolicy",
 }
 """Forms of an actor, and the class that evaluates each, imported when it is needed."""
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.arrays import select
-from marl_handover.policies.files import network_layers
+from marl_handover.policies.files import Layers, network_layers
 from marl_handover.policies.policy import Floats, SupervisorPolicy
 from marl_handover.task.observations import ARM_FIELDS, ODD_FIELDS, observe
 from marl_handover.task.rules import Rules
@@ -28,7 +27,7 @@ class NetworkPolicy(SupervisorPolicy):
 
     def __init__(self, rules: Rules, name: str, arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> None:
         super().__init__(rules, name)
-        self.about = dict(about)
+        self.about |= about
         self.variant = about["variant"]
         self.layers = network_layers(arrays, about)
         self.hybrid = about["kind"] == "hybrid"
@@ -39,16 +38,34 @@ class NetworkPolicy(SupervisorPolicy):
 
     def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
         """The likeliest branch and its mean place."""
-        observation = observe(self.rules, self.about["layout"], pose, goal, previous_arm).astype(np.float32)
-        return self._hybrid(observation) if self.hybrid else np.tanh(self._forward(observation)[..., :4])
+        observation = self._observation(pose, goal, previous_arm)
+        if not self.hybrid:
+            return np.tanh(self._forward(observation)[..., :4])
+        logits, place = self._branches(observation)
+        return self._action(logits.argmax(-1), place)
 
-    def _forward(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
-        for weight, bias in self.layers[:-1]:
+    def alternatives(self, action: Floats, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        """All branches, the likeliest first, where it has branches."""
+        if not self.hybrid:
+            return super().alternatives(action, pose, goal, previous_arm)
+        logits, place = self._branches(self._observation(pose, goal, previous_arm))
+        order = np.argsort(-logits, -1, kind="stable")
+        return np.stack([self._action(order[..., rank], place) for rank in range(order.shape[-1])], -2)
+
+    def _observation(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> NDArray[np.float32]:
+        if not self.about["task"].get("previous_arm", True):  # files of older versions do not say
+            previous_arm = 0 * previous_arm - 1
+        return observe(self.rules, self.about["layout"], pose, goal, previous_arm).astype(np.float32)
+
+    def _forward(self, x: NDArray[np.float32], layers: Layers | None = None) -> NDArray[np.float32]:
+        layers = layers or self.layers
+        for weight, bias in layers[:-1]:
             x = np.maximum(x @ weight + bias, 0)
-        weight, bias = self.layers[-1]
+        weight, bias = layers[-1]
         return x @ weight + bias
 
-    def _hybrid(self, observation: NDArray[np.float32]) -> Floats:
+    def _branches(self, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Logits (..., arms * (1 + modes)) of the choices (arm, final or mode), and places (..., arms * modes, 2) on the table."""
         modes = self.about["modes"]
         blocks = observation.reshape(*observation.shape[:-1], -1, len(ARM_FIELDS))
         sign = self._sign(blocks)
@@ -57,14 +74,18 @@ class NetworkPolicy(SupervisorPolicy):
         logits = out[..., : 1 + modes]
         if self.rules.external_finish:
             logits[..., 0] = -math.inf
-        flat = logits.reshape(*logits.shape[:-2], -1)
-        branch = flat.argmax(-1)
+        mean = np.tanh(out[..., 1 + modes : 1 + 3 * modes]).reshape(*out.shape[:-1], modes, 2)
+        signs = np.stack(np.broadcast_arrays(sign, self.beta_sign), -1)
+        place = mean * signs[..., None, :]
+        return logits.reshape(*logits.shape[:-2], -1), place.reshape(*place.shape[:-3], -1, 2)
+
+    def _action(self, branch: NDArray[np.int64], place: NDArray[np.float32]) -> Floats:
+        """Actions (..., 4) of branches (...)."""
+        modes = self.about["modes"]
         arm, choice = np.divmod(branch, 1 + modes)
-        mean = np.tanh(out[..., 1 + modes : 1 + 3 * modes]).reshape(*out.shape[:-2], -1, 2)
         index = arm * modes + np.maximum(choice - 1, 0)
-        place = np.take_along_axis(mean, np.asarray(index)[..., None, None], -2)[..., 0, :]
-        final, right = np.where(choice == 0, 1.0, -1.0), 2.0 * arm - 1.0
-        return np.stack([final, right, place[..., 0] * select(sign, arm), place[..., 1] * self.beta_sign[arm]], -1)
+        where = np.take_along_axis(place, np.asarray(index)[..., None, None], -2)[..., 0, :]
+        return np.stack([np.where(choice == 0, 1.0, -1.0), 2.0 * arm - 1.0, where[..., 0], where[..., 1]], -1)
 
     def _sign(self, blocks: NDArray[np.float32]) -> NDArray[np.float32]:
         if not self.about["canonical"]:

@@ -27,16 +27,27 @@ class SupervisorPolicy(ABC):
     Attributes:
         rules: the rule book it acts under; ``rules.epsilon_rad`` is the accuracy it aims at.
         name: what it was loaded as.
+        about: what its file says of it; empty if it was not trained.
     """
 
     variant = "hierarchical"
 
     def __init__(self, rules: Rules, name: str) -> None:
         self.rules, self.name = rules, name
+        self.about: dict[str, Any] = {}
 
     @abstractmethod
     def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
         """Actions: final, arm, alpha, beta."""
+
+    def alternatives(self, action: Floats, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        """What it would rather do if it could not do ``action`` (..., size): (..., k, size), the best first.
+
+        Here: another final, then the other arm, then both, at the same place. They must hold all four choices.
+        """
+        chosen = np.where(action[..., None, :2] > 0, 1.0, -1.0) * np.array([[-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+        rest = np.broadcast_to(action[..., None, 2:], (*chosen.shape[:-1], action.shape[-1] - 2))
+        return np.concatenate([chosen, rest], -1)
 
     def under(self, rules: Rules) -> SupervisorPolicy:
         """The same policy acting under another rule book, with another epsilon for instance."""

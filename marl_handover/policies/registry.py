@@ -12,13 +12,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 from marl_handover.cell import Cell, load_cell
-from marl_handover.config import CellConfig, MotionConfig, TaskConfig
+from marl_handover.config import CellConfig, CentralisedConfig, MotionConfig, TaskConfig
 from marl_handover.errors import CheckpointMismatch, MissingFile, UnknownChoice
 from marl_handover.motion.cost import motion_cost
 from marl_handover.policies.baselines import ExactPolicy, GreedyPolicy, RandomPolicy
 from marl_handover.policies.files import KINDS, read_policy, stored_settings
-from marl_handover.policies.network import NetworkPolicy
 from marl_handover.policies.policy import SupervisorPolicy
+from marl_handover.policies.shielded import SHIELDED, ShieldedPolicy
 from marl_handover.resources import package_path
 from marl_handover.task.rules import Rules
 
@@ -28,7 +28,8 @@ NAMES = ("exact", "random", "greedy", "pretrained_a", "pretrained_b")
 def load(
     name: str, cell: Cell | None = None, task: TaskConfig | None = None, seed: int = 0, *, motion: MotionConfig | None = None
 ) -> SupervisorPolicy:
-    """A policy by name: ``exact``, ``random``, ``greedy``, ``pretrained_a``, ``pretrained_b``, a run directory or a policy file (``.npz``).
+    """A policy by name: ``exact``, ``random``, ``greedy``, ``pretrained_a``, ``pretrained_b``, a run directory or a policy file (``.npz``),
+    or any of these shielded, as ``shielded:NAME``.
 
     Args:
         name: see above.
@@ -40,6 +41,8 @@ def load(
     Raises:
         UnknownChoice, MissingFile, CorruptFile, CheckpointMismatch: if there is no such policy or its file is not whole.
     """
+    if name.startswith(SHIELDED):
+        return ShieldedPolicy(load(name.removeprefix(SHIELDED), cell, task, seed, motion=motion))
     if name in ("exact", "random", "greedy"):
         rules = _rules(cell or load_cell(), task or TaskConfig(), motion)
         made = {"exact": ExactPolicy, "greedy": GreedyPolicy}
@@ -72,14 +75,17 @@ def adapted(
     settings = replace(own.rules.config, **{key: value for key, value in changes.items() if value is not None})
     settings.validate()
     trained = own.rules.config.architecture
-    if isinstance(own, NetworkPolicy) and settings.architecture != trained:
+    if own.about and settings.architecture != trained:
         raise CheckpointMismatch(name, "architecture", trained, settings.architecture)
-    about = own.about if isinstance(own, NetworkPolicy) else {}
-    return own.under(_rules(own.rules.cell if cell is None else load_cell(cell), settings, motion, about))
+    return own.under(_rules(own.rules.cell if cell is None else load_cell(cell), settings, motion, own.about))
 
 
 def _rules(cell: Cell, task: TaskConfig, motion: MotionConfig | None, about: Mapping[str, Any] | None = None) -> Rules:
     """The rule book that training used too; ``about`` is what a policy file says of itself."""
+    if about and about["variant"] == "centralised":
+        from marl_handover.envs.centralised import CentralisedRules
+
+        return CentralisedRules(cell, task, CentralisedConfig(**about["centralised"]), motion)
     return Rules(cell, task, motion_cost(cell, task, motion))
 
 
@@ -95,4 +101,4 @@ def _arrays(name: str) -> Mapping[str, NDArray[Any]]:
         return read_policy(path)
     if path.exists() or path.parent != Path():
         raise MissingFile("run directory or policy file", path, f"or choose one of: {', '.join(NAMES)}")
-    raise UnknownChoice("policy", name, (*NAMES, "a run directory", "a policy file (.npz)"))
+    raise UnknownChoice("policy", name, (*NAMES, f"{SHIELDED}NAME", "a run directory", "a policy file (.npz)"))

@@ -60,7 +60,12 @@ def observation_size(layout: str) -> int:
 
 
 def observe(rules: Rules, layout: str, pose: Array, goal: Array, previous_arm: Array, epsilon_rad: Array | float | None = None) -> Array:
-    """Observations (..., observation_size(layout)) of a batch: pose and goal (..., 3), previous_arm int (...) with -1 for none."""
+    """Observations (..., observation_size(layout)) of a batch: pose and goal (..., 3), previous_arm int (...) with -1 for none.
+
+    Where the task's ``previous_arm`` is off, they are those of an object that no arm has moved yet.
+    """
+    if not rules.config.previous_arm:
+        previous_arm = 0 * previous_arm - 1
     return _LAYOUTS[layout](rules, pose, goal, previous_arm, rules.epsilon_rad if epsilon_rad is None else epsilon_rad)
 
 

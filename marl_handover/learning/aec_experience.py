@@ -1,0 +1,208 @@
+"""Experience from the AEC environment itself, executors and all, played by TorchRL's collectors here, in processes or on a Ray cluster."""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
+from torchrl.weight_update import MultiProcessWeightSyncScheme
+
+from marl_handover.cell import build_cell
+from marl_handover.config import MotionConfig
+from marl_handover.envs.flat_aec import fields_of
+from marl_handover.envs.spaces import SUPERVISOR, Spaces
+from marl_handover.envs.supervisor_env import SupervisorEnv
+from marl_handover.errors import WorkFailed
+from marl_handover.learning.aec_policy import AecPolicy, WorkerPolicy, make_env, message, supervisor_fields
+from marl_handover.learning.experience import Collected, Experience, Explore
+from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.turns import TurnReader
+from marl_handover.task.rules import Outcome
+
+TURNS = 2
+"""Steps of the environment a decision, the supervisor's turn and an arm's; in architecture A sometimes one more."""
+
+
+class WorkerLost(WorkFailed):
+    """A process that collects was killed, or failed."""
+
+    def __init__(self, collector: str, reason: str) -> None:
+        self.collector, self.reason = collector, reason
+        super().__init__(f"a worker of collector={collector} is gone ({reason}); continue from the last checkpoint with train resume=RUN")
+
+
+class AecExperience(Experience):
+    """Decisions of the supervisor in ``HandoverEnv``, one environment a process, rebuilt from turn to turn.
+
+    A call plays about ``num_envs`` decisions and hands over the episodes that ended, in rows as :class:`EpisodeWriter` makes them. Episodes
+    are judged solved at the epsilon that the policy was shown.
+
+    A checkpoint holds how many decisions were made, not the running episodes: those are given up, and others begin, of problems that the
+    run has not seen.
+
+    Args:
+        env: the batched environment of the same cell and task, whose epsilon range and rule book are followed.
+        config: the run: ``backend``, ``executor``, ``collector`` and ``workers``.
+    """
+
+    def __init__(self, env: SupervisorEnv, config: TrainConfig) -> None:
+        self.env, self.config = env, config
+        self.model = build_cell(config.cell)
+        self.fields = fields_of(Spaces(self.model, MotionConfig()).observation[SUPERVISOR])
+        self.decisions = 0
+        self._collector: BaseCollector | None = None
+        self._batches: Iterator[TensorDictBase] = iter(())
+        self._policy: AecPolicy | None = None
+        self._reader = TurnReader(SUPERVISOR)
+        self._running: dict[int, TensorDict] = {}
+
+    def collect(self, explore: Explore) -> Collected:
+        """Let ``explore`` act; with workers it is :meth:`Algorithm.explore` or :meth:`Algorithm.blind`.
+
+        Raises:
+            WorkerLost: a worker is gone.
+        """
+        if self.config.collector == "local":
+            rollout = self._steps(explore)
+        else:
+            told = TensorDict(message(explore, self.env.epsilon_range_rad))
+            try:
+                rollout = self._steps(explore, told)
+            except Exception as error:  # a queue's, a pipe's, Ray's or TorchRL's own
+                raise WorkerLost(self.config.collector, (str(error).strip().splitlines() or [type(error).__name__])[0]) from error
+        steps = int(rollout[SUPERVISOR, "mask"].sum())
+        self.decisions += steps
+        rows, ended = self._finished(self._reader.read(rollout).to(self.env.device))
+        return Collected(steps, rows, None, ended)
+
+    def state_dict(self) -> dict[str, Any]:
+        """How far it is."""
+        return {"decisions": self.decisions}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state_dict`; what runs is given up."""
+        self.close()
+        self.decisions = int(state["decisions"])
+
+    def close(self) -> None:
+        """End the workers and close the environments."""
+        if self._collector is not None:
+            self._collector.shutdown()
+        self._collector, self._policy = None, None
+        self._reader, self._running = TurnReader(SUPERVISOR), {}
+
+    def _steps(self, explore: Explore, told: TensorDict | None = None) -> TensorDictBase:
+        """The collector's next batch, played by ``explore``, of which workers have to be told."""
+        if self._collector is None:
+            self._collector = self._start(explore)
+            self._batches = iter(self._collector)
+        if self._policy is not None:
+            self._policy.explore, self._policy.epsilon_range_rad = explore, self.env.epsilon_range_rad
+        else:
+            for worker in getattr(self._collector, "procs", ()):  # from a dead one TorchRL would wait for an answer for ever
+                if not worker.is_alive():
+                    raise ChildProcessError(f"process {worker.pid} ended with {worker.exitcode}")
+            self._collector.update_policy_weights_(told)
+        return next(self._batches)
+
+    def _start(self, explore: Explore) -> BaseCollector:
+        config, workers = self.config, 1 if self.config.collector == "local" else self.config.workers
+        seeds = np.random.SeedSequence([config.seed, self.decisions]).generate_state(2 * workers).astype(int).tolist()
+        frames = TURNS * -(-config.num_envs // workers) * workers
+        if config.collector == "local":
+            self._policy = AecPolicy(self.env.rules, self.model, config, explore, seeds[0])
+            own = make_env(config, seeds[1], self.model)
+            return Collector(own, self._policy, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=False)
+        makers = [partial(make_env, config, seed) for seed in seeds[:workers]]
+        actors = [partial(WorkerPolicy, config, seed) for seed in seeds[workers:]]
+        start = {"multiprocess": _processes, "ray": _ray_actors}[config.collector]
+        return start([*makers], [*actors], frames)
+
+    def _finished(self, turns: TensorDict) -> tuple[TensorDict | None, torch.Tensor]:
+        """Rows of the episodes that ended, and their number, that of the solved ones, and the transfers they took."""
+        whole, counts = [], torch.zeros(3)
+        for cell in turns["cell"].unique().tolist():
+            mine = turns[turns["cell"] == cell]
+            if cell in self._running:
+                mine = torch.cat([self._running.pop(cell), mine])
+            ends = mine["next", "done"][:, 0].nonzero()[:, 0]
+            over = int(ends[-1]) + 1 if len(ends) else 0
+            if over < len(mine):
+                self._running[cell] = mine[over:]
+            if over:
+                rows, last = self._rows(mine[:over], ends), mine[ends]
+                whole.append(rows)
+                solved = self._solved(rows[ends])
+                counts += torch.stack([torch.tensor(len(ends)), solved.sum().cpu(), last["next", "info", "transfers"].sum().cpu()])
+        return (torch.cat(whole) if whole else None), counts
+
+    def _solved(self, rows: TensorDict) -> torch.Tensor:
+        """Whether these last decisions solved their problems; one that ran out of transfers did not."""
+        rules = self.env.rules
+        final, feasible, epsilon = rules.decode(rows["action"]).final, rows["feasible"][:, 0], rows["epsilon"][:, 0]
+        verdict = rules.judge(rows["placed"], rows["desired_goal"], final, feasible, epsilon)
+        return (verdict.outcome == int(Outcome.SUCCESS)) & rows["terminated"][:, 0]
+
+    def _rows(self, turns: TensorDict, ends: torch.Tensor) -> TensorDict:
+        """Turns of whole episodes as a replay memory keeps them."""
+        pose, goal, previous = supervisor_fields(turns["observation"], self.fields)
+        info = turns["next", "info"]
+        first = torch.cat([ends.new_zeros(1), ends[:-1] + 1])
+        length = ends + 1 - first
+        elapsed = torch.arange(len(turns), device=ends.device) - first.repeat_interleave(length)
+        return TensorDict(
+            {
+                "achieved_goal": pose,
+                "desired_goal": goal,
+                "previous_arm": previous.long()[:, None],
+                "action": turns["action"],
+                "placed": info["placed"],
+                "feasible": info["feasible"][:, None] > 0,
+                "epsilon": turns["epsilon"],
+                "terminated": turns["next", "terminated"],
+                "remaining": (length.repeat_interleave(length) - 1 - elapsed)[:, None],
+                "elapsed": elapsed[:, None],
+            },
+            turns.batch_size,
+        )
+
+
+def _processes(makers: list[Callable[[], Any]], actors: list[Callable[[], Any]], frames: int) -> BaseCollector:
+    """One process a worker on this machine."""
+    return MultiSyncCollector(
+        makers,
+        policy_factory=actors,
+        frames_per_batch=frames,
+        total_frames=-1,
+        cat_results="stack",
+        num_threads=torch.get_num_threads(),  # or it changes that of this process
+        weight_sync_schemes={"policy": MultiProcessWeightSyncScheme()},
+    )
+
+
+def _ray_actors(makers: list[Callable[[], Any]], actors: list[Callable[[], Any]], frames: int) -> BaseCollector:
+    """One Ray actor a worker: on the cluster this process belongs to, else that of ``RAY_ADDRESS``, else one of its own on this machine."""
+    from torchrl.collectors.distributed import RayCollector
+
+    own: dict[str, Any] = {"log_to_driver": False, "logging_level": "warning", "include_dashboard": False}
+    if "RAY_ADDRESS" not in os.environ:
+        own["num_cpus"] = max(len(makers), os.cpu_count() or 1)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="The policy is not an nn.Module")  # the workers' are, which is what counts
+        return RayCollector(
+            makers,
+            policy_factory=actors,
+            frames_per_batch=frames,
+            total_frames=sys.maxsize,  # it takes -1 for nothing at all
+            sync=True,
+            ray_init_config=own,
+            remote_configs={"num_cpus": 1},
+        )

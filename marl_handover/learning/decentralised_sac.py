@@ -1,0 +1,278 @@
+"""Hybrid SAC for arms that take turns: an exact expectation over what *one* arm can choose, pass, finish or place.
+
+The discount is applied once a decision, whoever decides. Three kinds of learners:
+
+``independent``: two, one an arm, that share neither weights nor data. From an arm's turn to its next one; what the other did in between,
+and earned, is part of the environment.
+``shared``: one for both arms, which see the same problem mirrored; the same transitions.
+``ctde``: the actor of ``shared``; its critic sees both arms' blocks, and looks one decision ahead, through the other arm's turn.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from marl_handover.cell import NO_ARM
+from marl_handover.envs.decentralised import TurnRules
+from marl_handover.learning.algorithm import Algorithm, compiled
+from marl_handover.learning.algorithm_settings import SacConfig
+from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, SoftValue
+from marl_handover.learning.networks import Branches, arm_blocks, squashed_sample
+from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.turn_networks import PASS, PLACE, TurnActor, TurnCritic, turn_action
+from marl_handover.task.observations import ARM_FIELDS, observe
+from marl_handover.task.rules import Rules
+
+REACHES = ARM_FIELDS.index("reaches_object")
+OWN = len(ARM_FIELDS)
+"""Numbers of a view that an arm's networks see."""
+
+
+class BranchValues(NamedTuple):
+    """Of each branch (n, 2 + modes): log-probability and value, a place's with its entropy; and ``place_log_prob`` (n, modes)."""
+
+    log_probability: Tensor
+    value: Tensor
+    place_log_prob: Tensor
+
+
+class TurnSacLoss(HybridSacLoss):
+    """The three losses of one learner; the axis of the arms that its base has is the acting arm's alone."""
+
+    rules: TurnRules
+    actor: TurnActor  # type: ignore[assignment]
+    critic: TurnCritic
+    target: TurnCritic
+
+    def __init__(self, rules: TurnRules, actor: TurnActor, critic: TurnCritic, target: TurnCritic, config: SacConfig) -> None:
+        super().__init__(rules, actor, critic, target, config)  # type: ignore[arg-type]
+
+    def blocks(self, pose: Tensor, goal: Tensor, turn: Tensor, epsilon: Tensor) -> Tensor:
+        """Blocks (..., 2, fields) of objects (..., 3): of arm ``turn`` (...), then of the other."""
+        both = arm_blocks(observe(self.rules, "relative", pose, goal, torch.full_like(turn, NO_ARM), epsilon))
+        return torch.where((turn == 1)[..., None, None], both.flip(-2), both)
+
+    def afterstates(self, batch: dict[str, Tensor], place: Tensor) -> tuple[Tensor, Tensor]:
+        """As the base class, if the arm whose turn it is placed at ``place`` (n, 1, m, 2), in its own frame."""
+        shape = place.shape[:-1]
+        pose, goal = (batch[key][:, None, None].expand(*shape, 3) for key in ("pose", "goal"))
+        turn, epsilon = (batch[key][:, None, None].expand(shape) for key in ("turn", "epsilon"))
+        command = self.rules.command(torch.cat([torch.zeros_like(place[..., :1]), place], -1), turn)
+        placed, _ = self.rules.transfer(pose, goal, command)
+        penalty = self.config.reward_scale * self.rules.motion_penalty(turn, pose, placed)
+        return self.blocks(placed, goal, turn, epsilon), penalty
+
+    def branch_values(self, critic: TurnCritic, batch: dict[str, Tensor], noise: Tensor) -> BranchValues:
+        """What the acting arm's present policy says of its branches, and what ``critic`` does."""
+        branches = self.actor(batch["observation"])
+        place, place_log_prob = squashed_sample(branches, noise)
+        following, penalty = self.afterstates(batch, place)
+        place_value = critic.value_place(following).amin(0) - penalty - self.log_temperatures.detach()[0].exp() * place_log_prob
+        final_value = critic.value_final(batch["observation"]).amin(0)
+        pass_value = critic.value_place(batch["blocks"], torch.ones_like(final_value)).amin(0)
+        value = torch.cat([torch.stack([final_value, pass_value], -1), place_value[:, 0]], -1)
+        return BranchValues(branches.logits[:, 0].log_softmax(-1), value, place_log_prob[:, 0])
+
+    def soft_value(self, critic: TurnCritic, batch: dict[str, Tensor], noise: Tensor) -> SoftValue:  # type: ignore[override]
+        """Soft value of the present policy on its turn; ``probability`` (n, 2 + modes) and ``place_log_prob`` (n, modes) have no arms."""
+        log_probability, value, place_log_prob = self.branch_values(critic, batch, noise)
+        probability = log_probability.exp()
+        branch_entropy = -(probability * log_probability).sum(-1)
+        total = (probability * value).sum(-1) + self.log_temperatures.detach()[1].exp() * branch_entropy
+        return SoftValue(total, probability, branch_entropy, place_log_prob)
+
+    def actor_loss(self, batch: dict[str, Tensor], noise: Tensor, candidates: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As the base class; besides, a branch that is clearly better than the policy is made likelier, however unlikely it is.
+
+        The gradient of an expected value vanishes with the probability of a branch, and passing, the safest choice of a beginner, would
+        stay the only one long after the critic knows better.
+        """
+        log_probability, value, place_log_prob = self.branch_values(self.critic, batch, noise)
+        probability, temperature = log_probability.exp(), self.log_temperatures.detach().exp()[1]
+        expected, branch_entropy = (probability * value).sum(-1), -(probability * log_probability).sum(-1)
+        best, branch = value.detach().max(-1)
+        gain = (best - expected.detach()).clamp(0.0, 1.0)
+        missed = (gain * log_probability.gather(-1, branch[:, None])[:, 0]).mean()
+        loss = -(expected + temperature * branch_entropy).mean() - missed
+        if candidates.numel():
+            some = {key: tensor[: len(candidates)] for key, tensor in batch.items()}
+            loss = loss + self.config.candidate_weight * self._candidate_loss(some, candidates, offsets)
+        weight = probability[:, PLACE:].detach()
+        place_entropy = -(weight * place_log_prob).sum() / weight.sum().clamp_min(1e-6)
+        return loss, branch_entropy.mean().detach(), place_entropy.detach()
+
+    def critic_loss(self, batch: dict[str, Tensor], following: dict[str, Tensor], noise: Tensor) -> Tensor:
+        """Squared error of both critics on the branch that was taken, summed over the two."""
+        with torch.no_grad():
+            future = self.soft_value(self.target, following, noise).value
+            target = self.config.reward_scale * following["reward"] + following["discount"] * future
+        moved = self.critic.value_place(batch["after"], batch["passed"])
+        penalty = self.config.reward_scale * self.rules.motion_penalty(batch["turn"], batch["pose"], batch["placed"])
+        moved = moved - torch.where(batch["passed"], 0.0, penalty)
+        value = torch.where(batch["final"], self.critic.value_final(batch["observation"]), moved)
+        return (value - target).square().mean(1).sum()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """``loss_qvalue`` and ``loss_actor`` of a batch of :class:`TurnReplay`, TorchRL style; training uses the parts above."""
+        batch, following = self.unpacked(tensordict)
+        noise = torch.randn(2, len(tensordict), 1, self.actor.modes, 2, device=tensordict.device)
+        none = torch.zeros(0, 1, 0, 2, device=tensordict.device)
+        critic = self.critic_loss(batch, following, noise[0])
+        actor, branch, place = self.actor_loss(batch, noise[1], none, none)
+        return TensorDict({"loss_qvalue": critic, "loss_actor": actor, "entropy_branch": branch, "entropy_place": place})
+
+    def unpacked(self, batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Plain dictionaries, cheap to compile over: the decision, and the turn from which values are taken.
+
+        That is the other arm's, or, where the batch says what this one did, the same arm's after it.
+        """
+        goal, turn, epsilon, action, first = (batch[key] for key in ("goal", "turn", "epsilon", "action", "next"))
+        passed = self.rules.passes(action)
+        present = {
+            **self._state(batch["pose"], goal, turn, epsilon),
+            "passed": passed,
+            "final": self.rules.command(action, turn).final,
+            "placed": first["pose"],
+            "after": self.blocks(first["pose"], goal, turn, epsilon),
+        }
+        gamma = self.config.gamma
+        discount = gamma * (~first["terminated"]).float()
+        if "later" not in batch:
+            following = self._state(first["pose"], goal, 1 - turn, epsilon)
+            return present, {**following, "reward": first["reward"], "discount": discount}
+        second = batch["later"]
+        following = self._state(second["pose"], goal, turn, epsilon)
+        reward = first["reward"] + discount * second["reward"]
+        return present, {**following, "reward": reward, "discount": gamma * discount * (~second["terminated"]).float()}
+
+    def _state(self, pose: Tensor, goal: Tensor, turn: Tensor, epsilon: Tensor) -> dict[str, Tensor]:
+        blocks = self.blocks(pose, goal, turn, epsilon)
+        return {"pose": pose, "goal": goal, "turn": turn, "epsilon": epsilon, "blocks": blocks, "observation": blocks[:, 0]}
+
+
+class DecentralisedSac(HybridSac):
+    """Networks, optimisers and temperatures of one learner for both arms, or of one each.
+
+    An optimiser holds the parameters of all learners; as Adam treats every number by itself, that is one optimiser each. A gradient step
+    steps them all: of independent learners each one, on its own half of the batch.
+    """
+
+    kind = "turns"
+
+    def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
+        Algorithm.__init__(self, rules, config, generator)  # the base class would make a supervisor's networks
+        assert isinstance(rules, TurnRules)
+        self.learners, self.eager = rules.settings.learners, rules.settings.eager
+        arms = rules.cell.num_arms if self.learners == "independent" else 1
+        self.losses = nn.ModuleList([self._learner(rules) for _ in range(arms)]).to(self.device)
+        parts = [loss for loss in self.losses if isinstance(loss, TurnSacLoss)]
+        adam: dict[str, Any] = {"lr": self.config.learning_rate, "fused": True}
+        self.actors = nn.ModuleList([loss.actor for loss in parts])
+        self.critics = nn.ModuleList([loss.critic for loss in parts])
+        self.actor_optimizer = torch.optim.Adam(self.actors.parameters(), **adam)
+        self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), **adam)
+        self.temperature_optimizer = torch.optim.Adam([loss.log_temperatures for loss in parts], lr=self.config.temperature_rate)
+        self.parts = [(loss, compiled(loss.critic_loss, config.compile), compiled(loss.actor_loss, config.compile)) for loss in parts]
+        self.targets = self._targets(0.0)
+
+    def _learner(self, rules: TurnRules) -> TurnSacLoss:
+        own, seen = self.config, 2 if self.learners == "ctde" else 1
+        actor = TurnActor(own.actor_hidden, own.modes, own.canonical, own.harmonics)
+        critic, target = (TurnCritic(own.critic_hidden, own.final_hidden, own.canonical, own.harmonics, seen) for _ in range(2))
+        target.load_state_dict(critic.state_dict())
+        return TurnSacLoss(rules, actor, critic, target.requires_grad_(False), own)
+
+    def actor(self) -> nn.Module:
+        """The policy network, or the arms' two."""
+        return self.actors
+
+    def exported(self) -> list[list[nn.Linear]]:
+        """The layers of each actor."""
+        return [[module for module in actor.modules() if isinstance(module, nn.Linear)] for actor in self.actors]
+
+    def about(self) -> dict[str, Any]:
+        """As the base class, and what kind of learners."""
+        return {**super().about(), "learners": self.learners}
+
+    def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
+        """The losses hold all networks and the temperatures."""
+        return {
+            "losses": self.losses,
+            "actor_optimizer": self.actor_optimizer,
+            "critic_optimizer": self.critic_optimizer,
+            "temperature_optimizer": self.temperature_optimizer,
+        }
+
+    def _branches(self, observation: Tensor) -> Branches:
+        """What the arms whose turn it is say of :func:`~marl_handover.envs.decentralised.own_view` (n, VIEW_SIZE)."""
+        said = [actor(observation[:, :OWN]) for actor in self.actors]
+        right = observation[:, OWN] > 0
+        left, other = said[0], said[-1]
+        return Branches(*(torch.where(right.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(left, other, strict=True)))
+
+    @torch.no_grad()
+    def explore(self, observation: Tensor) -> Tensor:
+        """A branch and a place drawn from the policy. An arm that reaches the object does not pass when the other one just did, or by a
+        chance of ``eager``: policies that know little find waiting safest, and the memory would fill with episodes in which nothing
+        happens, or one arm does it all.
+        """
+        branches = self._branches(observation)
+        # Some cells follow the deterministic policy: where that goes in circles, its states must get into the memory.
+        curious = torch.arange(len(observation), device=self.device) >= int(self.config.greedy_share * len(observation))
+        eager = torch.rand(len(observation), generator=self.generator, device=self.device) < self.eager
+        busy = (observation[:, REACHES] > 0) & ((observation[:, OWN + 1] > 0) | (eager & curious))
+        branches.logits[:, 0, PASS] -= torch.where(busy, torch.inf, 0.0)
+        place, _ = squashed_sample(branches, self._noise(branches.mean.shape) * curious[:, None, None, None])
+        uniform = torch.rand(branches.logits.flatten(1).shape, generator=self.generator, device=self.device)
+        gumbel = -(-uniform.clamp_min(1e-20).log()).log()
+        blind = torch.rand(place.shape[:-1], generator=self.generator, device=self.device) < self.config.random_place
+        blind &= curious[:, None, None]
+        place = torch.where(blind[..., None], self._anywhere(place.shape), place)
+        return turn_action(branches.logits, place, gumbel * curious[:, None])
+
+    @torch.no_grad()
+    def act(self, observation: Tensor) -> Tensor:
+        """The likeliest branch and its mean place."""
+        branches = self._branches(observation)
+        return turn_action(branches.logits, branches.mean.tanh())
+
+    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """One step of all learners' critics, actors, temperatures and targets."""
+        stride = len(self.parts)
+        rows = [loss.unpacked(batch[number::stride]) for number, (loss, _, _) in enumerate(self.parts)]
+        count = len(batch) // stride
+        shape = (count, 1, self.config.modes, 2)
+        critic = [lossy(*both, self._noise(shape)) for (_, lossy, _), both in zip(self.parts, rows, strict=True)]
+        critic_loss = torch.stack(critic).sum()
+        self._step(self.critic_optimizer, critic_loss)
+        tried = (int(count * self.config.candidate_share), 1, self.config.candidates, 2)
+        self.critics.requires_grad_(False)
+        acted = [
+            lossy(present, self._noise(shape), self._anywhere(tried), self._nearby(tried))
+            for (_, _, lossy), (present, _) in zip(self.parts, rows, strict=True)
+        ]
+        actor_loss = torch.stack([loss for loss, _, _ in acted]).sum()
+        self._step(self.actor_optimizer, actor_loss)
+        self.critics.requires_grad_(True)
+        heat = [part[0].temperature_loss(branch, place, self.targets) for part, (_, branch, place) in zip(self.parts, acted, strict=True)]
+        self._step(self.temperature_optimizer, torch.stack(heat).sum())
+        with torch.no_grad():
+            for loss, _, _ in self.parts:
+                torch._foreach_lerp_(list(loss.target.parameters()), list(loss.critic.parameters()), self.config.tau)
+        return self._logged(critic_loss, actor_loss, acted)
+
+    def _logged(self, critic_loss: Tensor, actor_loss: Tensor, acted: list[tuple[Tensor, ...]]) -> dict[str, Tensor]:
+        """What is logged: sums of losses, means of the rest over the learners."""
+        temperature = torch.stack([loss.log_temperatures.detach().exp() for loss, _, _ in self.parts]).mean(0)
+        return {
+            "loss_critic": critic_loss.detach(),
+            "loss_actor": actor_loss.detach(),
+            "entropy_branch": torch.stack([branch for _, branch, _ in acted]).mean(),
+            "entropy_place": torch.stack([place for _, _, place in acted]).mean(),
+            "temperature_place": temperature[0],
+            "temperature_branch": temperature[1],
+        }

@@ -1,0 +1,63 @@
+"""Trained arms that take turns, asked as if they were a supervisor; evaluated in numpy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover.arrays import select
+from marl_handover.cell import NO_ARM
+from marl_handover.policies.files import network_layers
+from marl_handover.policies.network import NetworkPolicy
+from marl_handover.policies.policy import Floats
+from marl_handover.task.observations import ARM_FIELDS, observe
+from marl_handover.task.rules import Rules
+
+FINISH, PASS, PLACE = 0, 1, 2
+"""An arm's branches, as the networks have them (``marl_handover.learning.turn_networks``)."""
+
+
+class TurnsPolicy(NetworkPolicy):
+    """Two arms' policies as one supervisor.
+
+    It asks the arm whose turn it is: the other one than that which moved last; L at first. If that arm passes, it asks the other. If both
+    pass, nobody would ever move: the answer is not a number.
+
+    Args:
+        rules: the rule book to act under.
+        name: what it was loaded as.
+        arrays: weights, from a policy file: one network for both arms, or one each.
+        about: what the file says of them.
+    """
+
+    def __init__(self, rules: Rules, name: str, arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> None:
+        super().__init__(rules, name, arrays, about)
+        self.networks = [network_layers(arrays, about, number) for number in range(about["networks"])]
+
+    def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        """What the first arm that does not pass wants: its likeliest branch, and the mean place."""
+        previous = np.asarray(previous_arm)
+        both = observe(self.rules, "relative", pose, goal, np.full_like(previous, NO_ARM)).astype(np.float32)
+        blocks = both.reshape(*both.shape[:-1], -1, len(ARM_FIELDS))
+        sign = self._sign(blocks)
+        out = self._asked(self._harmonics(np.where(sign[..., None] < 0, blocks * self.odd, blocks)))
+        modes = self.about["modes"]
+        branch = out[..., : PLACE + modes].argmax(-1)
+        places = np.tanh(out[..., PLACE + modes : PLACE + 3 * modes]).reshape(*out.shape[:-1], modes, 2)
+        place = np.take_along_axis(places, np.maximum(branch - PLACE, 0)[..., None, None], -2)[..., 0, :]
+        first = np.where(previous == 0, 1, 0)
+        arm = np.where(select(branch, first) == PASS, 1 - first, first)
+        chosen = select(branch, arm)
+        alpha, beta = select(place[..., 0] * sign, arm), select(place[..., 1], arm) * self.beta_sign[arm]
+        action = np.stack([np.where(chosen == FINISH, 1.0, -1.0), 2.0 * arm - 1.0, alpha, beta], -1)
+        return np.where((chosen == PASS)[..., None], math.nan, action)
+
+    def _asked(self, blocks: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Outputs (..., arms, outputs) of each arm's network for its block."""
+        if len(self.networks) == 1:
+            return self._forward(blocks)
+        return np.stack([self._forward(blocks[..., arm, :], layers) for arm, layers in enumerate(self.networks)], -2)

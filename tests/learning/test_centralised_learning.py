@@ -1,0 +1,225 @@
+"""Training a policy that also moves: true hindsight, the mirror law, what its critic foresees, and the policy it leaves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from marl_handover import policies
+from marl_handover.cell.symmetry import GROUP
+from marl_handover.errors import InvalidSetting, UnknownChoice
+from marl_handover.learning.centralised_sac import with_actions
+from marl_handover.learning.export import policy_arrays, save_policy
+from marl_handover.learning.trainer import Trainer
+from marl_handover.learning.variants import make_variant
+from marl_handover.motion.ways import mirrored_numbers
+from marl_handover.runtime.assessment import AssessmentConfig, assess
+from marl_handover.task.observations import observe
+from marl_handover.task.rules import Rules
+
+NUMBERS = 20
+VARIANT = "variant=centralised"
+
+
+@pytest.fixture(scope="module")
+def trained(small, tmp_path_factory):
+    """A finished run of seconds."""
+    folder = tmp_path_factory.mktemp("centralised")
+    trainer = Trainer(small("sac", VARIANT, "steps=384", "evaluation_interval=384"), folder)
+    trainer.run()
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def trainer(small, tmp_path_factory):
+    """Many decisions in memory, none learned from; the blind motions are small, so that many are made."""
+    made = Trainer(small("sac", VARIANT, "num_envs=64"), tmp_path_factory.mktemp("blind"))
+
+    def explore(observation):
+        action = made.algorithm.blind(observation)
+        reach = made.rules.cell.reaches(made.experience.current["achieved_goal"])
+        action[:, 1] = torch.where(reach[:, 0], -1.0, 1.0)
+        action[:, 4:] *= 0.05
+        return action
+
+    for _ in range(50):
+        rows = made.experience.collect(explore).rows
+        if rows is not None:
+            made.replay.extend(rows)
+    return made
+
+
+def test_relabelled_transitions_are_true(trainer):
+    batch = trainer.replay.sample(2000)
+    previous = batch["previous_arm"][:, 0]
+    truth = trainer.rules.step(batch["achieved_goal"], batch["desired_goal"], previous, batch["action"], epsilon_rad=batch["epsilon"][:, 0])
+    assert batch["hindsight"].any()
+    same = (truth.feasible == batch["feasible"][:, 0]) & (truth.reward == batch["next", "reward"][:, 0])
+    assert same.float().mean() > 0.998, "but for motions at the very edge, rounded"
+    assert torch.equal(truth.terminated[same], batch["next", "terminated"][same, 0])
+    assert not batch["hindsight"][~batch["feasible"]].any()
+    shares = batch["feasible"].float().mean()
+    assert 0.2 < shares < 0.9
+
+
+def test_positions_are_read_off_the_observation(trainer, draw):
+    start, goal, previous, _ = (torch.tensor(part) for part in draw(trainer.rules.cell, 200, 1))
+    seen = observe(trainer.rules, "relative", start, goal, previous).float()
+    for found, expected in zip(trainer.algorithm.loss.actor.positions(seen), (start, goal), strict=True):
+        torch.testing.assert_close(found, expected[:, :2].float(), atol=1e-3, rtol=0)
+
+
+def test_the_policy_keeps_the_mirror_law(trainer, draw):
+    start, goal, previous, _ = (torch.tensor(part) for part in draw(trainer.rules.cell, 300, 2))
+    rules, actor = trainer.rules, trainer.algorithm.loss.actor
+    torch.nn.init.normal_(actor.move[-1].weight, std=0.5)  # it begins with zeros, which every law holds for
+    action = trainer.algorithm.act(observe(rules, "relative", start, goal, previous).float())
+    assert action[:, 4:].std() > 0.1
+    for symmetry in GROUP:
+        image = [symmetry.pose(start), symmetry.pose(goal), symmetry.arm(previous)]
+        found = trainer.algorithm.act(observe(rules, "relative", *image).float())
+        turned = torch.tensor(-1.0 if symmetry.mirror_x != symmetry.mirror_y else 1.0)
+        expected = torch.cat([symmetry.action(action[:, :4]), mirrored_numbers(action[:, 4:], turned.expand(len(action)))], -1)
+        alike = (found - expected).abs().max(-1).values < 1e-3
+        assert alike.float().mean() > 0.97  # bearings of 0 and two equal branches may fall either way
+
+
+def test_the_critic_foresees_refusals(trainer):
+    """What it learned from a batch holds for another one: refused motions rank above those that were made."""
+    algorithm = trainer.algorithm
+
+    def separation():
+        batch, _ = with_actions(trainer.replay.sample(1000))
+        to = torch.where(
+            batch["final"][:, None], batch["goal"][:, :2], trainer.rules.cell.chart.to_table(batch["action"][:, 2], batch["action"][:, 3])
+        )
+        reach = (trainer.rules.cell.reaches(batch["pose"]) & trainer.rules.cell.reaches(to)).gather(1, batch["arm"][:, None])[:, 0]
+        way, sign = algorithm.loss.actor.way(batch["arm"], batch["pose"][:, :2], to)
+        logit = algorithm.loss.critic.refused_logit(way, mirrored_numbers(batch["action"][:, Rules.action_size :], sign))[reach]
+        refused = ~batch["feasible"][reach]
+        return (logit[refused][:, None] > logit[~refused][None]).float().mean().item()
+
+    before = separation()
+    for _ in range(70):
+        present, following = with_actions(trainer.replay.sample(256))
+        noise = torch.randn(256, algorithm.loss.noise_width)
+        algorithm._step(algorithm.critic_optimizer, algorithm.loss.critic_loss(present, following, noise))
+    assert separation() > max(0.75, before + 0.1)
+
+
+def test_a_motion_that_is_surely_refused_is_worth_the_failure(trainer):
+    """The value of a branch lies between its own and that of a failure, by the chance of refusal."""
+    loss = trainer.algorithm.loss
+    batch, _ = with_actions(trainer.replay.sample(64))
+    noise = torch.randn(64, loss.noise_width, generator=torch.Generator().manual_seed(0))
+    values = []
+    with torch.no_grad():
+        loss.log_temperatures.fill_(-30.0)
+        bias = loss.critic.refusal[-1].bias
+        for sure in (-50.0, 50.0):
+            bias.add_(sure)
+            values.append(loss.drawn(loss.critic, batch, noise).value)
+            bias.sub_(sure)
+    assert torch.allclose(values[1], torch.full((64,), loss.failure), atol=1e-3)
+    assert (values[0] > values[1]).float().mean() > 0.9
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "box_sac"])
+def test_one_seed_one_run(small, table, tmp_path, algorithm):
+    runs = []
+    for name in ("one", "two"):
+        Trainer(small(algorithm, VARIANT, "steps=384", "evaluation_interval=384", "centralised.motion=flat"), tmp_path / name).run()
+        runs.append(table(tmp_path / name))
+    assert runs[0] == runs[1]
+    assert float(runs[0][-1]["gradient_step"]) > 0
+
+
+def test_torchrls_own_call_gives_the_losses(trainer):
+    losses = trainer.algorithm.loss(trainer.replay.sample(64))
+    assert losses["loss_qvalue"] > 0
+    assert losses["loss_actor"].requires_grad
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "box_sac"])
+@pytest.mark.parametrize("motion", ["flat", "offset"])
+def test_numpy_policy_is_the_torch_actor(small, draw, tmp_path, algorithm, motion):
+    config = small(algorithm, VARIANT, f"centralised.motion={motion}", "centralised.offset_rad=0.3")
+    made = Trainer(config, tmp_path)
+    if algorithm == "sac":
+        torch.nn.init.normal_(made.algorithm.loss.actor.move[-1].weight, std=0.1)
+    save_policy(tmp_path / "policy.npz", policy_arrays(made.algorithm, config, "a test"))
+    policy = policies.load(str(tmp_path / "policy.npz"))
+    assert policy.variant == "centralised"
+    assert policy.rules.settings == config.centralised
+    start, goal, previous, _ = draw(policy.rules.cell, 300, 6)
+    expected = made.algorithm.act(torch.tensor(observe(policy.rules, "relative", start, goal, previous)).float()).numpy()
+    found = policy.act(start, goal, previous)
+    assert found.shape == (300, 4 + NUMBERS)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    np.testing.assert_allclose(policy.act(start[0], goal[0], previous[0]), found[0], atol=1e-4)
+    others = policy.alternatives(found, start, goal, previous)
+    assert others.shape[-1] == 4 + NUMBERS
+    if algorithm == "sac":
+        np.testing.assert_allclose(others[:, 0], found, atol=1e-6)
+
+
+def test_a_run_is_evaluated_with_its_motions(trained):
+    folder = str(trained.folder)
+    done = assess(AssessmentConfig(policy=folder, episodes=40), progress=False)
+    assert done.report["variant"] == "centralised"
+    assert done.report["episodes"] == 40
+    again = assess(AssessmentConfig(policy=f"shielded:{folder}", episodes=40), progress=False)
+    assert again.report["success_rate"] >= done.report["success_rate"]
+
+
+@pytest.mark.parametrize("backend", ["noisy", "bullet"])
+def test_executors_do_not_make_its_motions(trained, backend):
+    with pytest.raises(InvalidSetting, match="kinematic"):
+        assess(AssessmentConfig(policy=str(trained.folder), episodes=1, backend=backend), progress=False)
+
+
+def test_it_does_not_play_the_supervisor_of_other_arms(trained):
+    with pytest.raises(InvalidSetting, match="motions are its own"):
+        policies.load(str(trained.folder))({"state": [0.0, 100.0, 1.0], "goal": [10.0, -120.0, -2.0], "previous_arm": 0})
+
+
+def test_a_saved_run_goes_on_as_it_would_have(small, table, tmp_path):
+    settings = small("sac", VARIANT, "steps=512", "evaluation_interval=256")
+    whole = Trainer(settings, tmp_path / "whole")
+    whole.run()
+    first = Trainer(settings, tmp_path / "parts")
+    first.folder.mkdir()
+    first.curriculum.enter(0)
+    while first.counters.step < 240:
+        first._advance()
+    first.save()
+    second = Trainer(settings, tmp_path / "parts")
+    second.restore()
+    second.run()
+    assert table(tmp_path / "parts")[-1] == table(tmp_path / "whole")[-1]
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ("task.architecture=A", "architecture"),
+        ("task.reward.motion_weight=1", "motion_weight"),
+        ("replay.symmetry=true", "symmetry"),
+        ("source=aec", "source"),
+        ("centralised.offset_rad=0", "offset_rad"),
+        ("centralised.control_points=5", "control_points"),
+    ],
+)
+def test_what_it_cannot_do_is_refused_by_name(small, changed, named):
+    with pytest.raises(InvalidSetting, match=named):
+        small("sac", VARIANT, changed).validate()
+
+
+@pytest.mark.parametrize("algorithm", ["td3", "ppo"])
+def test_other_algorithms_are_refused_by_name(small, algorithm):
+    config = small(algorithm, VARIANT)
+    variant = make_variant("centralised")
+    env = variant.env(config, torch.device("cpu"))
+    with pytest.raises(UnknownChoice, match=algorithm):
+        variant.algorithm(env.rules, config, torch.Generator())
