@@ -1,0 +1,88 @@
+"""The boards of a cell, one or two, as one thing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from marl_handover.hardware.clock import Clock
+from marl_handover.hardware.errors import BadReply, PortLost, WrongState
+from marl_handover.hardware.settings import HardwareConfig
+from marl_handover.hardware.ssc32 import SentLine, Ssc32
+from marl_handover.hardware.wiring import board_channels
+
+PULSE_TOLERANCE_US = 15
+"""A pulse read back, to 10 us, may be off by this much from the one sent."""
+
+PulsesOfBoards = Mapping[str, Mapping[int, int]]
+"""Board -> channel -> pulse in us."""
+
+
+class Boards:
+    """Every board that an arm is wired to; ``by_name`` holds each."""
+
+    def __init__(self, config: HardwareConfig, clock: Clock, *, dry_run: bool = False) -> None:
+        self.by_name = {
+            name: Ssc32(name, config.boards[name], config.timeouts, clock, log_entries=config.log_entries, dry_run=dry_run)
+            for name in config.used_boards()
+        }
+        self._channels = {name: board_channels(config, name) for name in self.by_name}
+
+    def connect(self) -> None:
+        """Connect all. Raises as :meth:`Ssc32.connect`; then none is left open."""
+        try:
+            for board in self.by_name.values():
+                board.connect()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let all ports go."""
+        for board in self.by_name.values():
+            board.close()
+
+    def pulses(self) -> dict[str, dict[int, int | None]]:
+        """What all wired channels put out; None: no pulse, and so no known position."""
+        return {name: board.pulses(self._channels[name]) for name, board in self.by_name.items()}
+
+    def require_powered(self, names: Iterable[str]) -> None:
+        """Ask one channel of each board for its pulse: a reset takes all. Raises :class:`BoardReset`."""
+        for name in names:
+            self.by_name[name].require_pulses(self._channels[name][:1])
+
+    def verify(self, wanted: PulsesOfBoards) -> None:
+        """Whether the boards put out what they were sent. Raises :class:`BoardReset` or :class:`BadReply`."""
+        for name, pulses in wanted.items():
+            self.by_name[name].require_pulses(pulses)
+            for channel, pulse in self.by_name[name].pulses(pulses).items():
+                if pulse is None or abs(pulse - pulses[channel]) > PULSE_TOLERANCE_US:
+                    raise BadReply(f"QP{channel}", str(pulse).encode(), f"about {pulses[channel]} us, as was sent")
+
+    def backlog_s(self, names: Iterable[str]) -> float:
+        """How long the last byte written to any of these boards is still on its way."""
+        return max((self.by_name[name].wire.backlog_s() for name in names), default=0.0)
+
+    def first_move(self, pulses: PulsesOfBoards, time_ms: int | None) -> tuple[SentLine, ...]:
+        """As :meth:`Ssc32.first_move`, board by board."""
+        return tuple(self.by_name[name].first_move(found, time_ms) for name, found in pulses.items())
+
+    def stop(self) -> bool:
+        """Stop every channel of every board that can be reached; whether all could."""
+        reached = True
+        for name, board in self.by_name.items():
+            try:
+                board.stop(self._channels[name])
+            except (PortLost, WrongState):
+                reached = False
+        return reached
+
+    def limp(self) -> None:
+        """No more pulses on any channel. Raises :class:`PortLost`, after all boards were tried."""
+        lost: PortLost | None = None
+        for name, board in self.by_name.items():
+            try:
+                board.limp(self._channels[name])
+            except PortLost as error:
+                lost = error
+        if lost is not None:
+            raise lost

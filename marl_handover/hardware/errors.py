@@ -1,0 +1,146 @@
+"""What can go wrong between a command and a servo. Messages say what to look at on the bench."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from marl_handover.errors import HandoverError, WorkFailed
+
+
+class BadCommand(HandoverError):
+    """A command that the board's language cannot carry, or that must not be sent."""
+
+    def __init__(self, name: str, value: Any, limit: str) -> None:
+        super().__init__(f"{name} = {value!r}: must be {limit}")
+        self.name, self.value, self.limit = name, value, limit
+
+
+class DuplicateChannel(BadCommand):
+    """One line addresses a channel twice."""
+
+    def __init__(self, channel: int) -> None:
+        super().__init__("channel", channel, "addressed once in a line")
+        self.channel = channel
+
+
+class MixedCommands(BadCommand):
+    """One line holds commands of different types, which the board does not take."""
+
+    def __init__(self, kinds: Iterable[str]) -> None:
+        super().__init__("the commands of a line", sorted(kinds), "of one type")
+
+
+class LineTooLong(BadCommand):
+    """A line is longer than what the board's buffer is trusted with."""
+
+    def __init__(self, length: int, limit: int) -> None:
+        super().__init__("the length of a line", length, f"at most {limit} bytes; send several lines")
+
+
+class DeviceError(WorkFailed):
+    """A port or a board does not do what it should."""
+
+
+class PortNotFound(DeviceError):
+    """No such port, or not exactly one to choose from."""
+
+    def __init__(self, port: str, reason: str, found: Iterable[str]) -> None:
+        self.port, self.found = port, tuple(found)
+        listing = ", ".join(self.found) or "none"
+        super().__init__(f"serial port {port or '(not set)'}: {reason}; ports found: {listing}; set hardware.boards.<name>.port")
+
+
+class PortLost(DeviceError):
+    """The port failed while in use: a cable came out, or another program has it open as well."""
+
+    def __init__(self, port: str, what: str, reason: str) -> None:
+        self.port, self.reason = port, reason
+        super().__init__(
+            f"{port} was lost while {what}: {reason}; check the USB cable and that no other program has the port open. "
+            "The arms hold, or finish the move they are in"
+        )
+
+
+class BoardSilent(DeviceError):
+    """The port opens but nothing answers."""
+
+    def __init__(self, port: str, bauds: Iterable[int]) -> None:
+        self.port, self.bauds = port, tuple(bauds)
+        tried = ", ".join(str(baud) for baud in self.bauds)
+        super().__init__(
+            f"{port} opens but no board answers at {tried} baud: is the controller's own supply on? (The USB chip is fed by the "
+            "computer, the controller is not: its LED must light up.) Then check the baud rate and that this port is the board's"
+        )
+
+
+class UnsuitableFirmware(DeviceError):
+    """A board answers, but not one whose commands are known."""
+
+    def __init__(self, port: str, version: str, reason: str) -> None:
+        self.port, self.version = port, version
+        super().__init__(f"{port}: firmware {version!r} cannot be used: {reason}")
+
+
+class BadReply(DeviceError):
+    """A reply is missing, too short or cannot be what was asked for."""
+
+    def __init__(self, asked: str, reply: bytes, wanted: str) -> None:
+        self.asked, self.reply = asked, reply
+        super().__init__(f"{asked} was answered by {reply[:32]!r}: expected {wanted}")
+
+
+class BoardReset(DeviceError):
+    """The board has forgotten its servos: it was reset, most likely by a supply that broke down under load."""
+
+    def __init__(self, board: str, channels: Iterable[int]) -> None:
+        self.board, self.channels = board, tuple(channels)
+        super().__init__(
+            f"board {board} has no pulse on channels {', '.join(map(str, self.channels))}: it was reset, and its next move would be a jump "
+            "at full speed. Most likely the supply broke down (give the logic its own 9 V, remove the VS=VL jumper). Put the arms into the "
+            "parked pose and arm again"
+        )
+
+
+class NoReference(DeviceError):
+    """A move was asked of a channel whose position the board does not know."""
+
+    def __init__(self, board: str, channels: Iterable[int]) -> None:
+        self.board, self.channels = board, tuple(channels)
+        super().__init__(
+            f"board {board}, channels {', '.join(map(str, self.channels))}: the first move after power-up is a jump at full speed, so only "
+            "the parked pose is allowed; arm first"
+        )
+
+
+class WrongState(DeviceError):
+    """A step of the life cycle was asked for out of its order."""
+
+    def __init__(self, what: str, state: str, needs: str) -> None:
+        self.what, self.state, self.needs = what, state, needs
+        super().__init__(f"cannot {what} while {state}: needs to be {needs}")
+
+
+class NotConfirmed(DeviceError):
+    """Nobody confirmed that the arms are in the parked pose."""
+
+    def __init__(self) -> None:
+        super().__init__("nobody confirmed that the arms are in the parked pose, so nothing was moved")
+
+
+class Stopped(DeviceError):
+    """The stop is latched: nothing moves until it is cleared."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
+        super().__init__(f"stopped: {reason}; nothing moves until the stop is cleared")
+
+
+class Stalled(DeviceError):
+    """The host was late by more than the watchdog allows."""
+
+    def __init__(self, late_s: float, limit_s: float) -> None:
+        self.late_s, self.limit_s = late_s, limit_s
+        super().__init__(
+            f"the motion was {1e3 * late_s:.0f} ms late, more than {1e3 * limit_s:.0f} ms: the host could not keep pace; arms hold"
+        )

@@ -1,0 +1,263 @@
+"""The safety gate: every command passes it on its way to the wire, and every refusal says what it found and what is allowed.
+
+It stands below planning and trusts none of it. It models where the arms have been sent, by time, and judges each command from there:
+numbers, joint limits, pulses, age, step, speed, and the room swept on the way: table, the arm itself, the other arm.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_handover.cell.build import CellModel
+from marl_handover.cell.kinematics import LIMIT_TOLERANCE_RAD
+from marl_handover.cell.urdf import ARM_JOINTS
+from marl_handover.errors import WorkFailed
+from marl_handover.hardware.calibration import ArmCalibration
+from marl_handover.hardware.clearance import alone_mm, arm_shapes, between_mm
+from marl_handover.hardware.settings import ARMS, HardwareConfig
+
+Floats = NDArray[np.float64]
+
+SWEEP_RAD = math.radians(2.0)
+"""The room swept by a command is looked at in steps of at most this much of any joint: under 11 mm at the hand's farthest."""
+
+LAG_S = 0.05
+"""Boards may be behind what they were sent by this much: two frames, and the line's own time."""
+
+_ROUNDING = 1e-6
+_ANGLES = (*ARM_JOINTS, "fingers")
+
+
+class Reason(enum.StrEnum):
+    """Why a command is refused."""
+
+    SHAPE = "shape"
+    NOT_FINITE = "not finite"
+    STALE = "stale"
+    NO_REFERENCE = "no reference"
+    DURATION = "duration"
+    JOINT_LIMIT = "joint limit"
+    PULSE_LIMIT = "pulse limit"
+    GRIPPER = "gripper"
+    STEP = "step"
+    SPEED = "speed"
+    TABLE = "table"
+    ITSELF = "itself"
+    OTHER_ARM = "other arm"
+
+
+class GateRejection(WorkFailed):
+    """A command that is not sent. ``value`` and ``limit`` are in the units of the message."""
+
+    def __init__(self, reason: Reason, arm: int | None, what: str, value: Any, limit: str) -> None:
+        self.reason, self.arm, self.what, self.value, self.limit = reason, arm, what, value, limit
+        shown = f"{value:.2f}" if isinstance(value, float) else value
+        whose = "" if arm is None else f"arm {ARMS[arm] if arm in range(len(ARMS)) else arm}, "
+        super().__init__(f"safety gate ({reason}): {whose}{what} is {shown}; allowed: {limit}")
+
+
+class JointCommand(NamedTuple):
+    """Where an arm is to be: ``joints_rad`` (5,), and how far each finger is to be from closed, in mm."""
+
+    arm: int
+    joints_rad: Floats
+    gripper_mm: float
+
+
+class _Held(NamedTuple):
+    """A move that was sent: from where to where (joints and fingers, 6), and when."""
+
+    start: Floats
+    target: Floats
+    begin_s: float
+    end_s: float
+
+    def at(self, t_s: float) -> Floats:
+        if t_s >= self.end_s or self.end_s <= self.begin_s:
+            return self.target
+        share = max(t_s - self.begin_s, 0.0) / (self.end_s - self.begin_s)
+        return self.start + share * (self.target - self.start)
+
+
+class SafetyGate:
+    """Judges commands for all arms of a cell.
+
+    Args:
+        model: geometry and joint limits.
+        config: limits, and the pulse limits of the wiring.
+        calibrations: of the arms, in order.
+    """
+
+    def __init__(self, model: CellModel, config: HardwareConfig, calibrations: Sequence[ArmCalibration]) -> None:
+        self.limits, self.calibrations = config.gate, tuple(calibrations)
+        self._arm, self._shapes = model.arm, arm_shapes(model)
+        self._bases = [np.array([base.x_mm, base.y_mm, base.facing_rad]) for base in model.cell.bases]
+        self._pulses = [np.array(config.arms[name].pulse_limits_us, float) for name in ARMS]
+        speeds = [model.arm.description.joint(name).velocity for name in ARM_JOINTS]
+        self.speed_rad_s = config.gate.speed_share * np.array(speeds)
+        self._speed = np.append(self.speed_rad_s, config.gate.finger_mm_s)
+        self._held: list[_Held | None] = [None] * len(self._bases)
+        # Compiled, or loaded, here: not between a plan and its first command.
+        still = np.zeros((1, 5))
+        alone_mm(still, self._shapes, np.empty(2))
+        between_mm(still, still, True, self._shapes, self._bases[0], self._bases[0])
+
+    def refer(self, arm: int, joints_rad: ArrayLike, gripper_mm: float) -> None:
+        """Take it that an arm stands still there."""
+        where = np.append(np.asarray(joints_rad, float), gripper_mm)
+        self._held[arm] = _Held(where, where, 0.0, 0.0)
+
+    def forget(self) -> None:
+        """No arm's position is known any more."""
+        self._held = [None] * len(self._held)
+
+    def freeze(self, t_s: float) -> None:
+        """Take it that all arms stopped where they were at ``t_s``."""
+        for arm in range(len(self._held)):
+            if (held := self._held[arm]) is not None:
+                now = held.at(t_s)
+                self.refer(arm, now[:5], float(now[5]))
+
+    def held(self, arm: int, t_s: float) -> tuple[Floats, float] | None:
+        """Joints (5,) and fingers that an arm has been sent to by ``t_s``; None if nothing is known."""
+        held = self._held[arm]
+        if held is None:
+            return None
+        now = held.at(t_s)
+        return now[:5].copy(), float(now[5])
+
+    def check(self, commands: Sequence[JointCommand], duration_s: float, now_s: float, made_s: float) -> None:
+        """Judge commands that are to be carried out together in ``duration_s`` from ``now_s``, thought of at ``made_s``.
+
+        Raises :class:`GateRejection` with the first thing that is wrong.
+        """
+        if not self.limits.enabled:
+            return
+        self._check_times(duration_s, now_s - made_s)
+        targets = {command.arm: self._target(command) for command in commands}
+        if not commands or len(targets) != len(commands):
+            raise GateRejection(
+                Reason.SHAPE, None, "arms of the command", [command.arm for command in commands], "each at most once, at least one"
+            )
+        for arm, target in targets.items():
+            held = self._held[arm]
+            if held is None:
+                raise GateRejection(Reason.NO_REFERENCE, arm, "its position", "unknown", "an arm that was armed in its parked pose")
+            self._check_ends(arm, target)
+            self._check_way(arm, np.abs(target - held.at(now_s)), duration_s)
+        self.check_room(targets, now_s)
+
+    def accept(self, commands: Sequence[JointCommand], duration_s: float, now_s: float) -> None:
+        """Commands were sent: take them for what the arms now do."""
+        for command in commands:
+            target = np.append(np.asarray(command.joints_rad, float), command.gripper_mm)
+            held = self._held[command.arm]
+            self._held[command.arm] = _Held(target if held is None else held.at(now_s), target, now_s, now_s + duration_s)
+
+    def check_room(self, targets: dict[int, Floats], now_s: float) -> None:
+        """Judge the room swept when arms go straight, in joint angles, from where they are to ``targets`` (each (5,) or longer).
+
+        Arms of one command move together. One that is still in an earlier move may be anywhere on the rest of it at any moment. All may be
+        behind by :data:`LAG_S`.
+        """
+        ways: list[Floats | None] = []
+        for arm, held in enumerate(self._held):
+            if held is None:
+                ways.append(None)
+                continue
+            now, late = held.at(now_s)[:5], held.at(now_s - LAG_S)[:5]
+            aim = targets[arm][:5] if arm in targets else held.target[:5]
+            ways.append(np.array([now, aim, late, aim] if arm in targets else [late, now, now, aim]))
+        longest = max((float(np.abs(way[1::2] - way[::2]).max()) for way in ways if way is not None), default=0.0)
+        share = np.linspace(0.0, 1.0, 1 + math.ceil(longest / SWEEP_RAD))[:, None]
+        swept = [None if way is None else _swept(way, share, arm in targets) for arm, way in enumerate(ways)]
+        for arm, Q in enumerate(swept):
+            if Q is not None and arm in targets:
+                self._check_alone(arm, Q)
+                self._check_others(arm, swept, targets)
+
+    def _check_times(self, duration_s: float, age_s: float) -> None:
+        if not (math.isfinite(duration_s) and 0.0 < duration_s <= 60.0):
+            raise GateRejection(Reason.DURATION, None, "the duration", duration_s, "above 0 and up to 60 s")
+        if not -_ROUNDING <= age_s <= self.limits.stale_s:
+            raise GateRejection(Reason.STALE, None, "its age", age_s, f"0 to {self.limits.stale_s:g} s")
+
+    def _target(self, command: JointCommand) -> Floats:
+        """Joints and fingers (6,)."""
+        if command.arm not in range(len(self._held)):
+            raise GateRejection(Reason.SHAPE, None, "the arm", command.arm, f"0 to {len(self._held) - 1}")
+        try:
+            target = np.append(np.asarray(command.joints_rad, float), float(command.gripper_mm))
+        except (TypeError, ValueError):
+            target = np.zeros(0)
+        if target.shape != (6,) or np.ndim(command.joints_rad) != 1:
+            raise GateRejection(
+                Reason.SHAPE, command.arm, "the command", np.shape(command.joints_rad), "five angles, and a number for the fingers"
+            )
+        if not np.isfinite(target).all():
+            raise GateRejection(Reason.NOT_FINITE, command.arm, "the command", target.tolist(), "finite numbers")
+        return target
+
+    def _check_ends(self, arm: int, target: Floats) -> None:
+        """Whether an arm may be at ``target`` (6,)."""
+        lower, upper = self._arm.lower_rad, self._arm.upper_rad
+        for index, joint in enumerate(ARM_JOINTS):
+            angle = float(target[index])
+            if not lower[index] - LIMIT_TOLERANCE_RAD <= angle <= upper[index] + LIMIT_TOLERANCE_RAD:
+                limit = f"{math.degrees(lower[index]):.2f} to {math.degrees(upper[index]):.2f} degrees"
+                raise GateRejection(Reason.JOINT_LIMIT, arm, joint, math.degrees(angle), limit)
+        if not 0.0 <= target[5] <= self.limits.finger_mm:
+            raise GateRejection(Reason.GRIPPER, arm, "the opening of each finger", float(target[5]), f"0 to {self.limits.finger_mm:g} mm")
+        for joint, pulse, (low, high) in zip(ARM_JOINTS, np.rint(self.calibrations[arm].to_us(target[:5])), self._pulses[arm], strict=True):
+            if not low <= pulse <= high:
+                raise GateRejection(Reason.PULSE_LIMIT, arm, f"the pulse of {joint}", float(pulse), f"{low:g} to {high:g} us")
+
+    def _check_way(self, arm: int, change: Floats, duration_s: float) -> None:
+        """Whether an arm may change so much, joints and fingers (6,), in one command."""
+        step_rad = math.radians(self.limits.step_deg)
+        widest = int(np.argmax(change[:5]))
+        if change[widest] > step_rad + _ROUNDING:
+            what = f"the step of {ARM_JOINTS[widest]}"
+            raise GateRejection(Reason.STEP, arm, what, math.degrees(change[widest]), f"up to {self.limits.step_deg:g} degrees")
+        over = change / duration_s - self._speed * (1 + _ROUNDING)
+        worst = int(np.argmax(over / self._speed))
+        if over[worst] > 0.0:
+            speed, limit, unit = change[worst] / duration_s, self._speed[worst], "mm/s"
+            if worst < 5:
+                speed, limit, unit = math.degrees(speed), math.degrees(limit), "degrees/s"
+            raise GateRejection(Reason.SPEED, arm, f"the speed of {_ANGLES[worst]}", float(speed), f"up to {limit:.1f} {unit}")
+
+    def _check_alone(self, arm: int, Q: Floats) -> None:
+        out = np.empty(2)
+        alone_mm(Q, self._shapes, out)
+        if out[0] < self.limits.table_clearance_mm:
+            limit = f"at least {self.limits.table_clearance_mm:g} mm"
+            raise GateRejection(Reason.TABLE, arm, "the height over the table on the way", float(out[0]), limit)
+        if out[1] < self.limits.self_clearance_mm:
+            limit = f"at least {self.limits.self_clearance_mm:g} mm"
+            raise GateRejection(Reason.ITSELF, arm, "the distance to itself on the way", float(out[1]), limit)
+
+    def _check_others(self, arm: int, swept: Sequence[Floats | None], targets: dict[int, Floats]) -> None:
+        own = swept[arm]
+        for other, Q in enumerate(swept):
+            if other == arm or own is None:
+                continue
+            if Q is None:
+                raise GateRejection(Reason.NO_REFERENCE, other, "its position", "unknown", "arms that were all armed in their parked pose")
+            gap = between_mm(own, Q, other in targets, self._shapes, self._bases[arm], self._bases[other])
+            if gap < self.limits.arm_clearance_mm:
+                limit = f"at least {self.limits.arm_clearance_mm:g} mm"
+                raise GateRejection(Reason.OTHER_ARM, arm, "the distance to the other arm on the way", gap, limit)
+
+
+def _swept(way: Floats, share: Floats, commanded: bool) -> Floats:
+    """Samples (n, 5) of the two straight pieces of ``way`` (4, 5); a single one of an arm that stands still and is not told to move."""
+    if not commanded and np.ptp(way, axis=0).max() == 0.0:
+        return way[:1].copy()
+    return np.concatenate([start + share * (end - start) for start, end in (way[:2], way[2:])])

@@ -1,0 +1,128 @@
+"""Calibrating an arm's servos from pictures: many postures, and where a camera saw a point of the hand, or a block it put down.
+
+A camera above the table sees no single joint. But the same ten numbers, zero and scale of five servos, have to explain every sighting at
+once; together with what is known beforehand (a protractor's reading, or the nominal servo) they follow from least squares. Dead bands are
+the noise: a few dozen postures, approached from both sides, average them out.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from marl_handover.arrays import wrap
+from marl_handover.cell.build import CellModel
+from marl_handover.cell.urdf import ARM_JOINTS
+from marl_handover.hardware.calibration import ArmCalibration, CalibrationProblem, ServoMap
+from marl_handover.hardware.settings import ARMS
+
+Floats = NDArray[np.float64]
+
+LEAST_SIGHTINGS = 8
+
+
+class Sighting(NamedTuple):
+    """What a camera saw while an arm was sent to ``pulses_us`` (5,).
+
+    ``seen_mm`` (2,) is a world position. With a camera's place it is where the ray through the point meets the plane z = ``plane_mm``, and
+    the point is ``point_mm`` (3,) of the grip's frame. Without one (NaN) it is where a block stood that the hand had put down: the grip's
+    own x and y. ``yaw_rad`` is the grip's world yaw, NaN if it was not seen.
+    """
+
+    pulses_us: Floats
+    seen_mm: Floats
+    yaw_rad: float = math.nan
+    camera_mm: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    plane_mm: float = 0.0
+    point_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class Identified(NamedTuple):
+    """A calibration, the sightings' root mean square residual, and each joint's standard deviation in the middle of the postures."""
+
+    calibration: ArmCalibration
+    residual_mm: float
+    joint_sd_deg: Floats
+
+
+def identify(
+    model: CellModel,
+    before: ArmCalibration,
+    sightings: Sequence[Sighting],
+    *,
+    position_sd_mm: float = 1.5,
+    yaw_sd_deg: float = 1.0,
+    zero_sd_deg: float = 5.0,
+    scale_sd: float = 0.05,
+) -> Identified:
+    """The calibration that explains the sightings best.
+
+    Args:
+        model: the cell; its geometry is taken to be right.
+        before: what was known, as lines; joints about which the sightings say nothing stay there.
+        sightings: eight at least, in postures as different as there is room for.
+        position_sd_mm: standard deviation of a sighting, dead bands included.
+        yaw_sd_deg: the same of its yaw.
+        zero_sd_deg: how well zeros were known, in degrees of the joint.
+        scale_sd: how well scales were known, relative.
+
+    Raises:
+        CalibrationProblem: too few sightings, or none of them finite; or what comes out is no servo.
+    """
+    usable = [sighting for sighting in sightings if np.isfinite(sighting.pulses_us).all() and np.isfinite(sighting.seen_mm).all()]
+    if len(usable) < LEAST_SIGHTINGS:
+        raise CalibrationProblem(before.arm, f"{len(usable)} usable sightings; {LEAST_SIGHTINGS} are needed at least")
+    pulses = np.array([sighting.pulses_us for sighting in usable], float)
+    zeros, slopes = _lines(before)
+    middle = (pulses.mean(axis=0) - zeros) / slopes
+    weights = np.concatenate([np.full(5, math.radians(zero_sd_deg)), np.full(5, scale_sd)])
+
+    def joints(parameters: Floats) -> Floats:
+        # Turned about the middle of the postures, so that zero and scale are told apart.
+        shift, stretch = parameters[:5], parameters[5:]
+        angles = (pulses - zeros) / slopes
+        return middle + shift + (angles - middle) * (1.0 + stretch)
+
+    def residuals(parameters: Floats) -> Floats:
+        off_mm, off_rad = _misses(model, ARMS.index(before.arm), joints(parameters), usable)
+        return np.concatenate([(off_mm / position_sd_mm).ravel(), off_rad / math.radians(yaw_sd_deg), parameters / weights])
+
+    found = least_squares(residuals, np.zeros(10), x_scale=weights, loss="soft_l1")
+    ends = np.stack([model.arm.lower_rad, model.arm.upper_rad])
+    at_us = zeros + slopes * (middle + (ends - middle - found.x[:5]) / (1.0 + found.x[5:]))
+    maps = [ServoMap(f"{before.arm} {joint}", list(zip(at_us[:, n], ends[:, n], strict=True))) for n, joint in enumerate(ARM_JOINTS)]
+    off_mm, _ = _misses(model, ARMS.index(before.arm), joints(found.x), usable)
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    calibration = replace(before, maps=tuple(maps), measured_unix_s=time.time())
+    return Identified(calibration, float(np.sqrt((off_mm**2).sum(axis=1).mean())), np.degrees(np.sqrt(np.diag(covariance)[:5])))
+
+
+def _lines(calibration: ArmCalibration) -> tuple[Floats, Floats]:
+    """Pulses at zero (5,) and slopes (5,) in us/rad of a calibration's maps."""
+    zeros = np.array([float(servo.to_us(0.0)) for servo in calibration.maps])
+    return zeros, np.array([float(servo.to_us(1.0)) for servo in calibration.maps]) - zeros
+
+
+def _misses(model: CellModel, arm: int, joints_rad: Floats, sightings: Sequence[Sighting]) -> tuple[Floats, Floats]:
+    """Predicted less seen: positions (n, 2) in mm, yaws (n,) in rad, 0 where none was seen."""
+    base, T = model.cell.bases[arm], model.arm.fk(joints_rad)
+    points = np.array([sighting.point_mm for sighting in sightings])
+    cos, sin = base.facing
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    at = (np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]) @ turn.T + np.array([base.x_mm, base.y_mm, 0.0])
+    cameras = np.array([sighting.camera_mm for sighting in sightings])
+    planes = np.array([sighting.plane_mm for sighting in sightings])
+    share = (planes - cameras[:, 2]) / (at[:, 2] - cameras[:, 2])
+    projected = cameras[:, :2] + share[:, None] * (at[:, :2] - cameras[:, :2])
+    predicted = np.where(np.isfinite(projected), projected, at[:, :2])
+    forward = T[:, :2, 0] @ turn[:2, :2].T
+    yaws = np.array([sighting.yaw_rad for sighting in sightings])
+    off = wrap(np.arctan2(forward[:, 1], forward[:, 0]) - yaws)
+    return predicted - np.array([sighting.seen_mm for sighting in sightings]), np.where(np.isfinite(off), off, 0.0)

@@ -1,0 +1,184 @@
+"""The connection under the arms: boards found, calibrations loaded, and the stop obeyed. Nothing here makes an arm move."""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from marl_handover.cell.build import CellModel
+from marl_handover.config import MotionConfig
+from marl_handover.hardware.boards import Boards
+from marl_handover.hardware.calibration import ArmCalibration, calibrations
+from marl_handover.hardware.clock import Clock, RealClock
+from marl_handover.hardware.errors import BoardReset, DeviceError, PortLost, Stopped, WrongState
+from marl_handover.hardware.gate import SafetyGate
+from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.settings import ARMS, HardwareConfig
+from marl_handover.hardware.wiring import Wiring
+
+_RETRY_S = 0.2
+
+
+class State(enum.StrEnum):
+    """Where a session is in its life."""
+
+    DISCONNECTED = "not connected"
+    CONNECTED = "connected"
+    CONFIGURED = "configured"
+    ARMED = "armed"
+    STOPPED = "stopped"
+    LOST = "lost"
+
+
+class BoardSession:
+    """Boards of a cell, from not connected to configured. Arguments: see :class:`~marl_handover.hardware.driver.ArmDriver`."""
+
+    def __init__(
+        self,
+        config: HardwareConfig,
+        model: CellModel,
+        motion: MotionConfig | None = None,
+        *,
+        clock: Clock | None = None,
+        latch: StopLatch | None = None,
+        dry_run: bool = False,
+    ) -> None:
+        config.validate()
+        self.config, self.model, self.motion = config, model, motion or MotionConfig()
+        self.clock: Clock = clock or RealClock()
+        self.latch = latch or StopLatch(config.stop_path())
+        self.dry_run, self.state = dry_run, State.DISCONNECTED
+        self.boards = Boards(config, self.clock, dry_run=dry_run)
+        self.calibrations: tuple[ArmCalibration, ...] = ()
+        self._gate: SafetyGate | None = None
+        self._wiring: Wiring | None = None
+
+    @property
+    def gate(self) -> SafetyGate:
+        """The safety gate. Raises :class:`WrongState` before :meth:`configure`."""
+        if self._gate is None:
+            raise WrongState("use the safety gate", self.state, State.CONFIGURED)
+        return self._gate
+
+    @property
+    def wiring(self) -> Wiring:
+        """Joints to pulses and back. Raises :class:`WrongState` before :meth:`configure`."""
+        if self._wiring is None:
+            raise WrongState("use the wiring", self.state, State.CONFIGURED)
+        return self._wiring
+
+    def connect(self) -> None:
+        """Find every board. Raises as :meth:`Ssc32.connect`; then no port is left open."""
+        self.close()
+        self.boards.connect()
+        self.state = State.CONNECTED
+
+    def configure(self) -> None:
+        """Load the calibrations. Raises as :func:`load_calibration`."""
+        if self.state is State.DISCONNECTED:
+            raise WrongState("configure", self.state, State.CONNECTED)
+        self.calibrations = calibrations(self.config, self.model.arm)
+        self._gate = SafetyGate(self.model, self.config, self.calibrations)
+        pin_mm = self.model.cell.config.block.pin_diameter_mm
+        self._wiring = Wiring(self.config, self.calibrations, pin_mm, self._gate.speed_rad_s)
+        self.state = State.CONFIGURED
+
+    def reconnect(self) -> None:
+        """After a lost port: wait for it to come back and connect afresh. Every channel then waits for its first move.
+
+        Raises :class:`Stopped`, or :class:`PortNotFound` or :class:`BoardSilent` if it does not come back in time.
+        """
+        end_s = self.clock.now_s() + self.config.timeouts.reconnect_s
+        while True:
+            try:
+                self.connect()
+                break
+            except DeviceError:
+                if self.clock.now_s() >= end_s:
+                    raise
+            self.wait(_RETRY_S)
+        self.configure()
+
+    def close(self) -> None:
+        """Let all ports go; servos keep their last pulse. Again is fine."""
+        self.boards.close()
+        if self._gate is not None:
+            self._gate.forget()
+        self.state = State.DISCONNECTED
+
+    def wait(self, duration_s: float) -> None:
+        """Wait, looking at the stop all the while. Raises :class:`Stopped`."""
+        end_s = self.clock.now_s() + duration_s
+        while True:
+            self.obey()
+            left_s = end_s - self.clock.now_s()
+            if left_s <= 0:
+                return
+            self.clock.sleep_s(min(self.config.stream.poll_s, left_s))
+
+    def obey(self) -> None:
+        """If the stop is latched, stop every channel and raise :class:`Stopped`."""
+        if self.latch.is_set():
+            if self.halt():
+                self.latch.obeyed()
+            raise Stopped(self.latch.reason())
+
+    def stop(self, reason: str) -> None:
+        """Latch the stop, for every session, and stop every channel. It stays until ``latch.clear()`` and :meth:`resume`."""
+        try:
+            self.latch.latch(reason)
+        finally:
+            self.halt()
+
+    def halt(self) -> bool:
+        """Stop every channel where it is and refuse moves until :meth:`resume`. Whether every board was reached; lost ones do not raise."""
+        reached = self.boards.stop()
+        if self._gate is not None:
+            self._gate.freeze(self.clock.now_s())
+        if self.state is State.ARMED:
+            self.state = State.STOPPED
+        return reached
+
+    def resume(self) -> None:
+        """After the stop was cleared: read back where the channels are, to 10 us, and allow moves from there.
+
+        Raises :class:`Stopped` while the stop is latched, and :class:`BoardReset` if a board has forgotten.
+        """
+        if self.state is not State.STOPPED:
+            raise WrongState("resume", self.state, State.STOPPED)
+        if self.latch.is_set():
+            raise Stopped(self.latch.reason())
+        if not self.dry_run:
+            with self._watched():
+                self.boards.require_powered(self.boards.by_name)
+                self._refer(self.boards.pulses())
+        self.state = State.ARMED
+
+    def limp(self) -> None:
+        """No more pulses: the arms sink. They have to be put into the parked pose and armed again."""
+        self.boards.limp()
+        self.gate.forget()
+        self.state = State.CONFIGURED
+
+    @contextlib.contextmanager
+    def _watched(self) -> Iterator[None]:
+        """Keep the state true when electronics fail."""
+        try:
+            yield
+        except PortLost:
+            self.state = State.LOST
+            raise
+        except BoardReset:
+            self.gate.forget()
+            self.state = State.CONFIGURED
+            raise
+
+    def _refer(self, pulses: Mapping[str, Mapping[int, int | None]]) -> None:
+        """Take what the boards put out for where the arms are: the middle of the 10 us that a reading may mean."""
+        middles = {name: {channel: (pulse or 0) + 5.0 for channel, pulse in found.items()} for name, found in pulses.items()}
+        for arm in range(len(ARMS)):
+            joints, fingers = self.wiring.state(middles, arm)
+            self.gate.refer(arm, np.clip(joints, self.model.arm.lower_rad, self.model.arm.upper_rad), fingers)

@@ -1,0 +1,134 @@
+"""A serial port that cannot hang: every wait has an end, every failure is a :class:`PortLost`, every byte is in the log."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import serial
+
+from marl_handover.hardware.clock import Clock
+from marl_handover.hardware.errors import PortLost, PortNotFound
+from marl_handover.hardware.ports import list_serial_ports
+from marl_handover.hardware.settings import TimeoutConfig
+
+BITS_PER_BYTE = 10
+_SCHEMES = "marl_handover.hardware.emulator"
+_FAILURES = (serial.SerialException, OSError)  # in_waiting of a port that was pulled out raises a bare OSError
+
+if _SCHEMES not in serial.protocol_handler_packages:
+    serial.protocol_handler_packages.append(_SCHEMES)  # so that every port of this package may be ssc32emu://name
+
+
+class Logged(NamedTuple):
+    """Bytes that went over a wire. ``direction``: ``>`` to the board, ``<`` from it, ``x`` held back by a dry run."""
+
+    t_s: float
+    direction: str
+    data: bytes
+
+
+class Wire:
+    """One open port.
+
+    Args:
+        port: a device path or a pyserial URL.
+        baud: bits per second.
+        timeouts: limits of waiting.
+        clock: whose time the log is in.
+        log_entries: how many the log keeps.
+
+    Raises:
+        PortNotFound: it cannot be opened: it is not there, somebody else has it, or the user may not.
+    """
+
+    def __init__(self, port: str, baud: int, timeouts: TimeoutConfig, clock: Clock, log_entries: int) -> None:
+        self.port, self._timeouts, self._clock = port, timeouts, clock
+        self.log: deque[Logged] = deque(maxlen=log_entries)
+        self._lock = threading.RLock()
+        self._free_s = 0.0
+        try:
+            self._serial: Any = serial.serial_for_url(
+                port, baudrate=baud, timeout=timeouts.reply_s, write_timeout=timeouts.write_s, exclusive=True
+            )
+        except (*_FAILURES, ValueError) as error:
+            text = " ".join(str(error).split())
+            reason = f"it cannot be opened ({text})"
+            if "ermission denied" in text:
+                reason += "; run: sudo usermod -aG dialout $USER, and log in again"
+            raise PortNotFound(port, reason, [found.path for found in list_serial_ports()]) from error
+        # A pty has no such mode, other systems neither; without it an answer takes FTDI's 16 ms.
+        with contextlib.suppress(OSError, ValueError, AttributeError, NotImplementedError):
+            self._serial.set_low_latency_mode(True)
+
+    @property
+    def baud(self) -> int:
+        """Bits per second."""
+        return int(self._serial.baudrate)
+
+    def set_baud(self, baud: int) -> None:
+        """Change the rate of the open port."""
+        with self._guarded("changing its rate"):
+            self._serial.baudrate = baud
+
+    def write(self, data: bytes) -> float:
+        """Send; the time at which it was handed over."""
+        with self._lock, self._guarded("writing"):
+            now_s = self._clock.now_s()
+            self._serial.write(data)
+            self._free_s = max(now_s, self._free_s) + len(data) * BITS_PER_BYTE / self.baud
+            self.log.append(Logged(now_s, ">", data))
+            return now_s
+
+    def note_held_back(self, data: bytes) -> float:
+        """Log what a dry run does not send."""
+        now_s = self._clock.now_s()
+        self.log.append(Logged(now_s, "x", data))
+        return now_s
+
+    def backlog_s(self) -> float:
+        """How long what was written is still on its way."""
+        return max(0.0, self._free_s - self._clock.now_s())
+
+    def ask(self, question: bytes, size: int, *, until: bytes = b"", timeout_s: float | None = None) -> bytes:
+        """Send a question and read what comes back: up to ``size`` bytes, up to the first ``until``, or whatever there is at the timeout.
+
+        What had come in before is thrown away: it answers nothing that was asked now.
+        """
+        with self._lock, self._guarded("reading"):
+            self._serial.reset_input_buffer()
+            end_s = self._clock.now_s() + self.backlog_s() + (self._timeouts.reply_s if timeout_s is None else timeout_s)
+            self.write(question)
+            reply = bytearray()
+            while len(reply) < size and not (until and reply.endswith(until)):
+                left_s = end_s - self._clock.now_s()
+                if left_s <= 0:
+                    break
+                self._serial.timeout = left_s
+                reply += self._serial.read(1 if until else size - len(reply))
+            if reply:
+                self.log.append(Logged(self._clock.now_s(), "<", bytes(reply)))
+            return bytes(reply)
+
+    def drain(self, quiet_s: float) -> None:
+        """Throw away what comes in, until nothing has for ``quiet_s``, or a second has passed."""
+        with self._lock, self._guarded("reading"):
+            self._serial.timeout = quiet_s
+            end_s = self._clock.now_s() + 1.0
+            while self._serial.read(256) and self._clock.now_s() < end_s:
+                pass
+
+    def close(self) -> None:
+        """Let the port go, whatever state it is in."""
+        with contextlib.suppress(*_FAILURES):
+            self._serial.close()
+
+    @contextlib.contextmanager
+    def _guarded(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except _FAILURES as error:
+            raise PortLost(self.port, what, " ".join(str(error).split())) from error
