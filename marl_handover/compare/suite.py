@@ -30,7 +30,7 @@ SIZES = ("full", "quick")
 FIGURES = ("curves", "bars", "end_states", "profiles", "workspace")
 TABLES = ("evaluation", "milestones", "runs", "comparison")
 CURVE_MEASURES = ("success_rate", "mean_steps", "steps_ratio", "training_success_rate", "training_mean_length")
-BAR_MEASURES = ("success_rate", "success_in_the_end", "mean_steps", "steps_ratio")
+BAR_MEASURES = ("success_rate", "success_in_the_end", "mean_steps", "steps_ratio", "path_mm", "executor_path_mm")
 CURVE_AXES = ("step", "share")
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
@@ -84,6 +84,7 @@ class TableSpec:
     rows: list[str] = field(default_factory=list)
     evaluations: list[str] = field(default_factory=list)
     pairs: list[list[str]] = field(default_factory=list)  # of comparison: [better?, than]
+    paths: bool = False  # of evaluation: also how far the grip travels in a transfer
 
 
 @dataclass

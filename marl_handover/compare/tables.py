@@ -115,6 +115,7 @@ def _evaluation(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell
         Column("mean, %", ("success_rate_mean",)),
         _interval_column("mean steps", "mean_steps"),
         _interval_column("steps ÷ optimum", "steps_ratio"),
+        *([Column("path, mm", ("path_mm",)), Column("executors' on the same way, mm", ("executor_path_mm",))] if spec["paths"] else []),
     ]
     rows = []
     for row, name in shown:
@@ -130,6 +131,7 @@ def _evaluation(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell
                 _plain(found["success_rate"]["mean"], "{:.2f}", 100),
                 _interval(found["mean_steps"], "{:.2f}"),
                 _interval(found.get("steps_ratio"), "{:.3f}"),
+                *(_plain((found.get(name) or {}).get("mean")) for name in ("path_mm", "executor_path_mm") if spec["paths"]),
             ]
         )
     return columns, rows

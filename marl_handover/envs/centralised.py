@@ -11,9 +11,11 @@ from marl_handover.arrays import Array, namespace, one_where
 from marl_handover.cell import Cell, build_cell
 from marl_handover.compose import to_yaml
 from marl_handover.config import CentralisedConfig, MotionConfig, TaskConfig
+from marl_handover.envs.cycle_check import LENGTH_SAMPLES, CycleCheck
 from marl_handover.errors import InvalidSetting
 from marl_handover.motion.batched import MotionCheck
 from marl_handover.motion.batched_points import MotionNumbers, ends_of
+from marl_handover.motion.splines import sampled_basis
 from marl_handover.task.rules import Command, Rules
 
 
@@ -51,7 +53,7 @@ class CentralisedRules(Rules):
             raise InvalidSetting("task.reward.motion_weight", weight, "0 with variant=centralised, whose paths have no price")
         settings.validate()
         self.settings = settings
-        self.check, self.numbers = _checked(cell, settings, motion or MotionConfig())
+        self.check, self.numbers, self.grip = _checked(cell, settings, motion or MotionConfig())
         self.action_size = Rules.action_size + self.numbers.count
 
     def decode(self, action: Array) -> MotionCommand:
@@ -72,6 +74,15 @@ class CentralisedRules(Rules):
         allowed = feasible & self._allowed(command.arm, pose[..., :2], target, command.motion, feasible)
         return one_where(allowed, moved, pose), allowed
 
+    def path_mm(self, arm: Array, from_mm: Array, to_mm: Array, motion: Array) -> Array:
+        """Length (n,) of the grip's paths: arms (n,), places (n, 2) in mm, motions (n, M); numpy."""
+        ends = ends_of(self.cell, *(torch.tensor(np.asarray(part)) for part in (arm, from_mm, to_mm)))
+        points = self.numbers.points(ends, torch.tensor(np.asarray(motion))).double().numpy()
+        joints = sampled_basis(LENGTH_SAMPLES, points.shape[1], self.settings.degree) @ points
+        level = np.concatenate([joints, np.zeros_like(joints[..., :1])], -1)
+        steps = np.diff(self.grip.grip_mm(0, level), axis=1)  # all arms are alike
+        return np.sqrt((steps**2).sum(-1)).sum(-1)
+
     def _allowed(self, arm: Array, from_mm: Array, to_mm: Array, motion: Array, asked: Array) -> Array:
         """Whether motions are allowed, bool (...), numpy or torch; only those are looked at that are ``asked`` for."""
         shape = asked.shape
@@ -87,14 +98,14 @@ class CentralisedRules(Rules):
         return allowed.numpy() if namespace(asked) is np else allowed
 
 
-_CHECKS: dict[str, tuple[MotionCheck, MotionNumbers]] = {}
+_CHECKS: dict[str, tuple[MotionCheck, MotionNumbers, CycleCheck]] = {}
 
 
-def _checked(cell: Cell, settings: CentralisedConfig, motion: MotionConfig) -> tuple[MotionCheck, MotionNumbers]:
-    """The check and the meaning of the numbers of a cell; computed once for each, since packing the bodies takes half a second."""
+def _checked(cell: Cell, settings: CentralisedConfig, motion: MotionConfig) -> tuple[MotionCheck, MotionNumbers, CycleCheck]:
+    """The check, the meaning of the numbers and the grip of a cell, once for each: packing the bodies takes half a second."""
     parts: tuple[Any, ...] = (cell.config, settings, motion)
     key = "".join(to_yaml(part) for part in parts)
     if key not in _CHECKS:
         model = build_cell(cell.config)
-        _CHECKS[key] = MotionCheck(model, motion, settings), MotionNumbers(model, motion, settings)
+        _CHECKS[key] = MotionCheck(model, motion, settings), MotionNumbers(model, motion, settings), CycleCheck(model, motion)
     return _CHECKS[key]

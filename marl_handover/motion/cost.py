@@ -151,6 +151,11 @@ def cost_table(cell: Cell, motion: MotionConfig) -> CostTable:
     return _TABLES[key]
 
 
+def known_table(cell: Cell, motion: MotionConfig) -> CostTable | None:
+    """The table of a cell, if it is shipped or was kept from before; nothing is built."""
+    return _found(settings_key(cell, motion))
+
+
 def settings_key(cell: Cell, motion: MotionConfig) -> str:
     """A short name of all that the path lengths depend on: 16 hexadecimal digits.
 

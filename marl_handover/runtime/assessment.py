@@ -25,9 +25,10 @@ from marl_handover.config import (
 )
 from marl_handover.errors import InvalidSetting
 from marl_handover.learning.evaluation import Evaluation, decision_time, evaluate, random_problems, read_problems
-from marl_handover.learning.rollout import Episodes
+from marl_handover.learning.rollout import Decision, Episodes
 from marl_handover.learning.trace import Trace
 from marl_handover.policies import SupervisorPolicy
+from marl_handover.runtime.paths import PathLengths
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Rules
 
@@ -110,12 +111,17 @@ def _play_kinematic(config: AssessmentConfig, policy: SupervisorPolicy, traced: 
     """All problems at once, on the batched rules."""
     rules = policy.rules
     problems, noise = _problems(config, rules), rules.config.noise
-    trace = Trace(rules)
+    trace, paths = Trace(rules), PathLengths(rules)
+
+    def observer(decision: Decision) -> None:
+        paths(decision)
+        if traced:
+            trace(decision)
+
     with _bar(problems, progress) as bar:
-        observer, timed = trace if traced else None, policy.under(rules).act
-        result = evaluate(rules, policy.act, problems, config.seed, observer, bar.update, timed)
+        result = evaluate(rules, policy.act, problems, config.seed, observer, bar.update, policy.under(rules).act)
     shown = {"noise": noise.report()} if rules.noisy or noise.observed else {}
-    return result, trace.text, rules, {**shown, **_repaired(policy)}
+    return result, trace.text, rules, {**shown, **paths.report(), **_repaired(policy)}
 
 
 def _play_loop(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool, progress: bool) -> Played:

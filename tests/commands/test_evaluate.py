@@ -60,7 +60,7 @@ def run_b(tmp_path_factory):
 def test_result_has_the_promised_fields(tmp_path, run_b, policy, architecture):
     name = str(run_b) if policy == "RUN" else policy
     result, _ = evaluated(tmp_path, f"policy={name}", "episodes=120", f"architecture={architecture}", "epsilon_deg=8", "seed=3")
-    assert set(result) == FIELDS | {"symmetry_order"}  # which the promise leaves room for
+    assert set(result) == FIELDS | {"symmetry_order", "path_mm", "executor_path_mm"}  # which the promise leaves room for
     asked = {"policy": name, "architecture": architecture, "variant": "hierarchical", "backend": "kinematic", "epsilon_deg": 8.0, "seed": 3}
     assert {key: result[key] for key in asked} == asked
     assert set(result["outcomes"]) == OUTCOMES
