@@ -260,14 +260,12 @@ class DecentralisedConfig:
 
     learners: str = "ctde"  # independent (nothing shared), shared (one learner for both), ctde (shared actor, centralised critic)
     pass_reward: float = -0.5
-    eager: float = 0.25  # share of exploration's decisions in which an arm that reaches the object does not pass
     decisions_per_transfer: int = 3  # an episode has at most so many times task.max_steps decisions, passes included
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
         require_choice("decentralised.learners", self.learners, LEARNERS)
         require_between("decentralised.pass_reward", self.pass_reward, -1e6, 0)
-        require_between("decentralised.eager", self.eager, 0, 1)
         require_at_least("decentralised.decisions_per_transfer", self.decisions_per_transfer, 1)
 
     def validate_task(self, task: TaskConfig) -> None:

@@ -98,7 +98,7 @@ class FlatAEC(BaseWrapper):
 
 
 class FlatHandover(PettingZooWrapper):
-    """TorchRL's view of :class:`FlatAEC`: TorchRL's own wrapper, but for three detours that take half of its time.
+    """TorchRL's view of :class:`FlatAEC`: TorchRL's own wrapper, but for three detours, which cost a third of its time.
 
     It looks up attributes of the environment through ``dir()``, copies observations deeply to take action masks out of them, of which there
     are none here, and warns of versions of PettingZoo it was not tested with.

@@ -40,10 +40,10 @@ class WorkerLost(WorkFailed):
 
 
 class AecExperience(Experience):
-    """Decisions of the supervisor in ``HandoverEnv``, one environment a process, rebuilt from turn to turn.
+    """Decisions of the supervisor in ``HandoverEnv``, rebuilt from turn to turn.
 
-    A call plays about ``num_envs`` decisions and hands over the episodes that ended, in rows as :class:`EpisodeWriter` makes them. Episodes
-    are judged solved at the epsilon that the policy was shown.
+    ``num_envs`` environments are played side by side, shared out over the workers. A call plays about as many decisions and hands over the
+    episodes that ended, in rows as :class:`EpisodeWriter` makes them. Episodes are judged solved at the epsilon that the policy was shown.
 
     A checkpoint holds how many decisions were made, not the running episodes: those are given up, and others begin, of problems that the
     run has not seen.
@@ -62,7 +62,7 @@ class AecExperience(Experience):
         self._batches: Iterator[TensorDictBase] = iter(())
         self._policy: AecPolicy | None = None
         self._reader = TurnReader(SUPERVISOR)
-        self._running: dict[int, TensorDict] = {}
+        self._running: TensorDict | None = None
 
     def collect(self, explore: Explore) -> Collected:
         """Let ``explore`` act; with workers it is :meth:`Algorithm.explore` or :meth:`Algorithm.blind`.
@@ -97,7 +97,7 @@ class AecExperience(Experience):
         if self._collector is not None:
             self._collector.shutdown()
         self._collector, self._policy = None, None
-        self._reader, self._running = TurnReader(SUPERVISOR), {}
+        self._reader, self._running = TurnReader(SUPERVISOR), None
 
     def _steps(self, explore: Explore, told: TensorDict | None = None) -> TensorDictBase:
         """The collector's next batch, played by ``explore``, of which workers have to be told."""
@@ -115,34 +115,34 @@ class AecExperience(Experience):
 
     def _start(self, explore: Explore) -> BaseCollector:
         config, workers = self.config, 1 if self.config.collector == "local" else self.config.workers
-        seeds = np.random.SeedSequence([config.seed, self.decisions]).generate_state(2 * workers).astype(int).tolist()
-        frames = TURNS * -(-config.num_envs // workers) * workers
+        cells = -(-config.num_envs // workers)
+        draws = np.random.SeedSequence([config.seed, self.decisions]).generate_state((1 + cells) * workers).astype(int)
+        seeds = draws.reshape(workers, 1 + cells).tolist()
+        frames = TURNS * cells * workers
         if config.collector == "local":
-            self._policy = AecPolicy(self.env.rules, self.model, config, explore, seeds[0])
-            own = make_env(config, seeds[1], self.model)
+            self._policy = AecPolicy(self.env.rules, self.model, config, cells, explore, seeds[0][0])
+            own = make_env(config, seeds[0][1:], self.model)
             return Collector(own, self._policy, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=False)
-        makers = [partial(make_env, config, seed) for seed in seeds[:workers]]
-        actors = [partial(WorkerPolicy, config, seed) for seed in seeds[workers:]]
+        makers = [partial(make_env, config, own[1:]) for own in seeds]
+        actors = [partial(WorkerPolicy, config, cells, own[0]) for own in seeds]
         start = {"multiprocess": _processes, "ray": _ray_actors}[config.collector]
         return start([*makers], [*actors], frames)
 
     def _finished(self, turns: TensorDict) -> tuple[TensorDict | None, torch.Tensor]:
         """Rows of the episodes that ended, and their number, that of the solved ones, and the transfers they took."""
-        whole, counts = [], torch.zeros(3)
-        for cell in turns["cell"].unique().tolist():
-            mine = turns[turns["cell"] == cell]
-            if cell in self._running:
-                mine = torch.cat([self._running.pop(cell), mine])
-            ends = mine["next", "done"][:, 0].nonzero()[:, 0]
-            over = int(ends[-1]) + 1 if len(ends) else 0
-            if over < len(mine):
-                self._running[cell] = mine[over:]
-            if over:
-                rows, last = self._rows(mine[:over], ends), mine[ends]
-                whole.append(rows)
-                solved = self._solved(rows[ends])
-                counts += torch.stack([torch.tensor(len(ends)), solved.sum().cpu(), last["next", "info", "transfers"].sum().cpu()])
-        return (torch.cat(whole) if whole else None), counts
+        if self._running is not None:
+            turns = torch.cat([self._running, turns])
+        turns = turns[turns["cell"].argsort(stable=True)]
+        cell, position = turns["cell"], torch.arange(len(turns), device=turns["cell"].device)
+        end = torch.where(turns["next", "done"][:, 0], position, -1)
+        last_end = torch.full((int(cell.max()) + 1,), -1, device=cell.device).scatter_reduce(0, cell, end, "amax") if len(cell) else end
+        over = position <= last_end[cell]
+        self._running, whole = turns[~over], turns[over]
+        ends = whole["next", "done"][:, 0].nonzero()[:, 0]
+        if len(ends) == 0:
+            return None, torch.zeros(3)
+        rows, transfers = self._rows(whole, ends), whole["next", "info", "transfers"][ends]
+        return rows, torch.tensor([len(ends), int(self._solved(rows[ends]).sum()), int(transfers.sum())]).float()
 
     def _solved(self, rows: TensorDict) -> torch.Tensor:
         """Whether these last decisions solved their problems; one that ran out of transfers did not."""

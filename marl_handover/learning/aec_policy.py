@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.envs import SerialEnv
 
 from marl_handover.cell import CellModel, build_cell
 from marl_handover.config import MotionConfig
@@ -26,41 +28,47 @@ from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Rules
 
+ACTIONS = 4
+"""Numbers in the supervisor's action."""
+
 MODES = ("blind", "explore")
 """Methods of an algorithm that training lets act."""
 
 
-def make_env(config: TrainConfig, seed: int, model: CellModel | None = None) -> FlatHandover:
-    """The environment that a run asks for, as TorchRL plays it; ``seed`` decides its problems and its backend's noise."""
-    env = handover_aec.env(backend=config.backend, cell=model or build_cell(config.cell), task=config.task)
-    return FlatHandover(FlatAEC(env), seed)
+def make_env(config: TrainConfig, seeds: Sequence[int], model: CellModel | None = None) -> SerialEnv:
+    """Environments (n,) that a run asks for, as TorchRL plays them; ``seeds`` (n) decide their problems and their backends' noise."""
+    model = model or build_cell(config.cell)
+
+    def one(seed: int) -> FlatHandover:
+        return FlatHandover(FlatAEC(handover_aec.env(backend=config.backend, cell=model, task=config.task)), seed)
+
+    return SerialEnv(len(seeds), [partial(one, seed) for seed in seeds])
 
 
-def supervisor_fields(observation: NDArray[np.float32], fields: Mapping[str, tuple[slice, Any]]) -> tuple[Any, Any, Any]:
-    """Pose (..., 3), goal (..., 3) and previous arm int (...), -1 for none, of flat observations (..., size) of the supervisor."""
+def supervisor_fields(observation: Any, fields: Mapping[str, tuple[slice, Any]]) -> tuple[Any, Any, Any]:
+    """Pose (..., 3), goal (..., 3) and previous arm (...), -1 for none, of flat observations (..., size) of the supervisor."""
     previous = observation[..., fields["previous_arm"][0]][..., 0]
     return observation[..., fields["state"][0]], observation[..., fields["goal"][0]], previous - 1
 
 
 class AecPolicy(TensorDictModuleBase):
-    """Actions of whichever agent's turn it is, in one environment (no batch dimension).
+    """Actions of whichever agent's turn it is, in a batch of environments (n,).
 
     Each episode's epsilon is drawn log-uniformly from ``epsilon_range_rad`` and shown to the supervisor. The environment does not know it
     and judges at the task's; replay judges again, at the epsilon it draws. In architecture B an episode's course does not depend on it.
 
-    Exploration may treat the cells of a batch differently, so that some follow the deterministic policy for whole episodes. Each episode
-    therefore takes the place of a cell in a batch of ``num_envs``: of the one that has decided least so far, for in a batch all decide
-    equally often, be their episodes long or short.
+    Exploration is always asked for all environments at once, each in its own row, because some algorithms treat rows differently.
 
     Args:
         rules: rule book that observations are made by.
         model: the cell, for the executors.
         config: the run.
+        count: number of environments, n.
         explore: the supervisor's actions.
         seed: of the epsilons.
     """
 
-    def __init__(self, rules: Rules, model: CellModel, config: TrainConfig, explore: Explore, seed: int) -> None:
+    def __init__(self, rules: Rules, model: CellModel, config: TrainConfig, count: int, explore: Explore, seed: int) -> None:
         super().__init__()
         motion = MotionConfig()
         spaces = Spaces(model, motion)
@@ -70,45 +78,39 @@ class AecPolicy(TensorDictModuleBase):
         self.device_of_learner = torch.device(config.device)
         self.epsilon_range_rad = (rules.epsilon_rad, rules.epsilon_rad)
         self._fields = {agent: fields_of(space) for agent, space in spaces.observation.items()}
+        self._widths = {agent: width(space) for agent, space in spaces.action.items()}
         self._arms = {agent: ExecutorAgent(agent, model, config.executor, motion) for agent in ARM_AGENTS}
         self._random = np.random.default_rng(seed)
-        self._played = np.zeros(config.num_envs, int)
-        self._cell, self._epsilon = 0, rules.epsilon_rad
-        self._idle = {key: torch.zeros(1, 4 if key[0] == SUPERVISOR else _width(spaces.action[key[0]])) for key in self.out_keys}
-        self._idle[SUPERVISOR, "epsilon"] = torch.zeros(1, 1)
+        self._epsilon = np.full(count, rules.epsilon_rad)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Sets the actions of all agents, zeros for those whose turn it is not, and the ``epsilon`` the supervisor acted for."""
-        actions = dict(self._idle)
-        if tensordict[SUPERVISOR, "mask"]:
-            actions[SUPERVISOR, "action"] = self._command(tensordict[SUPERVISOR])
-            actions[SUPERVISOR, "epsilon"] = torch.full((1, 1), self._epsilon)
+        """Sets the actions of all agents, zeros for those whose turn it is not, and the ``epsilon`` the supervisor acts for."""
+        turn = tensordict[SUPERVISOR, "mask"]
+        action = torch.zeros(len(turn), 1, ACTIONS)
+        if turn.any():
+            action[turn] = self._commands(tensordict[SUPERVISOR], turn[:, 0].numpy())[turn[:, 0]]
+        tensordict.set((SUPERVISOR, "action"), action)
+        tensordict.set((SUPERVISOR, "epsilon"), torch.from_numpy(self._epsilon.astype(np.float32))[:, None, None])
         for agent in ARM_AGENTS:
-            if tensordict[agent, "mask"]:
-                actions[agent, "action"] = self._answer(agent, tensordict[agent, "observation"])
-        for key, value in actions.items():
-            tensordict.set(key, value)
+            answers = torch.zeros(len(turn), 1, self._widths[agent])
+            for row in tensordict[agent, "mask"][:, 0].nonzero()[:, 0].tolist():
+                answers[row, 0] = self._answer(agent, tensordict[agent, "observation"][row, 0])
+            tensordict.set((agent, "action"), answers)
         return tensordict
 
-    def _command(self, seen: TensorDictBase) -> Tensor:
-        if not seen["info", "transfers"]:
-            self._begin()
-        self._played[self._cell] += 1
-        pose, goal, previous = supervisor_fields(seen["observation"].numpy(), self._fields[SUPERVISOR])
-        observation = observe(self.rules, self.rules.config.layout, pose, goal, previous, np.array([self._epsilon]))
-        rows = torch.from_numpy(observation.astype(np.float32)).to(self.device_of_learner).expand(len(self._played), -1)
-        return self.explore(rows)[self._cell, None].cpu()
-
-    def _begin(self) -> None:
-        """An episode."""
-        self._cell = int(self._played.argmin())
+    def _commands(self, seen: TensorDictBase, turn: NDArray[np.bool_]) -> Tensor:
+        """Actions (n, 4); ``turn`` (n,) says whose are wanted."""
+        begins = turn & (seen["info", "transfers"][:, 0].numpy() == 0)
         low, high = self.epsilon_range_rad
-        self._epsilon = math.exp(self._random.uniform(math.log(low), math.log(high)))
+        self._epsilon[begins] = np.exp(self._random.uniform(math.log(low), math.log(high), begins.sum()))
+        pose, goal, previous = supervisor_fields(seen["observation"][:, 0].numpy(), self._fields[SUPERVISOR])
+        observation = observe(self.rules, self.rules.config.layout, pose, goal, previous, self._epsilon)
+        return self.explore(torch.from_numpy(observation.astype(np.float32)).to(self.device_of_learner)).cpu()
 
     def _answer(self, agent: str, observation: Tensor) -> Tensor:
-        numbers = observation[0].numpy()
+        numbers = observation.numpy()
         action = self._arms[agent].act({name: numbers[part] for name, (part, _) in self._fields[agent].items()})
-        return torch.from_numpy(np.concatenate([np.reshape(value, -1) for value in action.values()], dtype=np.float32))[None]
+        return torch.from_numpy(np.concatenate([np.reshape(value, -1) for value in action.values()], dtype=np.float32))
 
 
 class WorkerPolicy(AecPolicy):
@@ -118,29 +120,30 @@ class WorkerPolicy(AecPolicy):
 
     Args:
         config: the run.
+        count: number of environments.
         seed: of exploration, and of the epsilons.
     """
 
-    def __init__(self, config: TrainConfig, seed: int) -> None:
+    def __init__(self, config: TrainConfig, count: int, seed: int) -> None:
         config.device, config.compile = "cpu", "off"
         torch.set_num_threads(config.threads)
         variant = make_variant(config.variant)
         rules = variant.env(config, torch.device("cpu")).rules
         self._learner = variant.algorithm(rules, config, torch.Generator().manual_seed(seed))
-        super().__init__(rules, build_cell(config.cell), config, self._learner.blind, seed)
+        super().__init__(rules, build_cell(config.cell), config, count, self._learner.blind, seed)
         told = message(self._learner.blind, self.epsilon_range_rad)
         self.weights = nn.Parameter(told["weights"], requires_grad=False)
         self.orders = nn.Parameter(told["orders"], requires_grad=False)
         self._obeyed = torch.empty(0)
 
-    def _command(self, seen: TensorDictBase) -> Tensor:
+    def _commands(self, seen: TensorDictBase, turn: NDArray[np.bool_]) -> Tensor:
         if not torch.equal(self._obeyed, self.weights):
             self._obeyed = self.weights.detach().clone()
             nn.utils.vector_to_parameters(self._obeyed, self._learner.actor().parameters())
         mode, *bounds = self.orders.tolist()
         self.explore = getattr(self._learner, MODES[int(mode)])
         self.epsilon_range_rad = (bounds[0], bounds[1])
-        return super()._command(seen)
+        return super()._commands(seen, turn)
 
 
 def message(explore: Explore, epsilon_range_rad: tuple[float, float]) -> dict[str, Tensor]:
@@ -156,5 +159,6 @@ def message(explore: Explore, epsilon_range_rad: tuple[float, float]) -> dict[st
     return {"weights": weights, "orders": torch.tensor([MODES.index(name), *epsilon_range_rad])}
 
 
-def _width(space: Any) -> int:
+def width(space: Any) -> int:
+    """Length of a space's vector."""
     return sum(part.stop - part.start for part, _ in fields_of(space).values())

@@ -166,7 +166,7 @@ class DecentralisedSac(HybridSac):
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
         Algorithm.__init__(self, rules, config, generator)  # the base class would make a supervisor's networks
         assert isinstance(rules, TurnRules)
-        self.learners, self.eager = rules.settings.learners, rules.settings.eager
+        self.learners = rules.settings.learners
         arms = rules.cell.num_arms if self.learners == "independent" else 1
         self.losses = nn.ModuleList([self._learner(rules) for _ in range(arms)]).to(self.device)
         parts = [loss for loss in self.losses if isinstance(loss, TurnSacLoss)]
@@ -216,16 +216,15 @@ class DecentralisedSac(HybridSac):
 
     @torch.no_grad()
     def explore(self, observation: Tensor) -> Tensor:
-        """A branch and a place drawn from the policy. An arm that reaches the object does not pass when the other one just did, or by a
-        chance of ``eager``: policies that know little find waiting safest, and the memory would fill with episodes in which nothing
-        happens, or one arm does it all.
+        """A branch and a place drawn from the policy. An arm that reaches the object does not pass when the other one just did.
+
+        Policies that know little find waiting safest, and the memory would fill with episodes in which nothing happens.
         """
         branches = self._branches(observation)
         # Some cells follow the deterministic policy: where that goes in circles, its states must get into the memory.
         curious = torch.arange(len(observation), device=self.device) >= int(self.config.greedy_share * len(observation))
-        eager = torch.rand(len(observation), generator=self.generator, device=self.device) < self.eager
-        busy = (observation[:, REACHES] > 0) & ((observation[:, OWN + 1] > 0) | (eager & curious))
-        branches.logits[:, 0, PASS] -= torch.where(busy, torch.inf, 0.0)
+        needed = (observation[:, REACHES] > 0) & (observation[:, OWN + 1] > 0)
+        branches.logits[:, 0, PASS] -= torch.where(needed, torch.inf, 0.0)
         place, _ = squashed_sample(branches, self._noise(branches.mean.shape) * curious[:, None, None, None])
         uniform = torch.rand(branches.logits.flatten(1).shape, generator=self.generator, device=self.device)
         gumbel = -(-uniform.clamp_min(1e-20).log()).log()

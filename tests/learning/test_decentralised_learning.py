@@ -189,15 +189,11 @@ def test_exploration_does_not_wait_for_an_arm_that_waits(learner_of, paper):
     reaches = seen[:, ARM_FIELDS.index("reaches_object")] > 0
     waited = torch.arange(400) % 2 == 0
     seen[:, FIELDS + 1] = waited.float()
-    for eager in (0.0, 1.0):
-        learner = learner_of("shared", f"decentralised.eager={eager}", "algorithm.greedy_share=0.0")
-        with torch.no_grad():
-            learner.actors[0].net[-1].bias[PASS] += 50.0
-        passed = learner.rules.passes(learner.explore(seen))
-        assert passed[~reaches].all()
-        assert not passed[reaches & waited].any()
-        assert bool(passed[reaches & ~waited].all()) is (eager == 0.0)
-        assert bool(passed[reaches & ~waited].any()) is (eager == 0.0)
+    learner = learner_of("shared")
+    with torch.no_grad():
+        learner.actors[0].net[-1].bias[PASS] += 50.0
+    passed = learner.rules.passes(learner.explore(seen))
+    assert torch.equal(passed, ~(reaches & waited))
     assert learner.rules.passes(learner.act(seen)).all()
 
 
@@ -290,7 +286,7 @@ def test_arms_without_a_supervisor_learn_to_work_together(small, tmp_path):
     own = (f"algorithm.{setting}" for setting in pace)
     watch = ("num_envs=32", "steps=8192", "evaluation_episodes=300", "evaluation_interval=100000", "task.epsilon_deg=15", stage)
     config = small("sac", "variant=decentralised", "decentralised.learners=shared", *own, *watch)
-    assert Trainer(config, tmp_path).run()["validation"]["success_rate"] > 0.6
+    assert Trainer(config, tmp_path).run()["validation"]["success_rate"] > 0.85  # (1.00, 1.00)
 
 
 def test_only_transfers_count_as_steps(small, tmp_path):
@@ -314,7 +310,6 @@ def test_only_transfers_count_as_steps(small, tmp_path):
         ("replay.capacity=900", "capacity"),
         ("algorithm.batch_size=33", "batch_size"),
         ("decentralised.pass_reward=0.1", "pass_reward"),
-        ("decentralised.eager=1.5", "eager"),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(small, setting, named):

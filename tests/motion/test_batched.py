@@ -86,9 +86,9 @@ def assert_same_verdicts(kit, arm, from_mm, to_mm, points):
 
 @pytest.mark.parametrize(("kind", "size"), [("offset", 0.0), ("offset", 0.1), ("offset", 1.0), ("flat", 1.0)])
 def test_agrees_with_the_compiled_check_on_random_splines(kit, kind, size):
-    arm, from_mm, to_mm = ways(kit.cell, 150)
+    arm, from_mm, to_mm = ways(kit.cell, 100)
     numbers = kit.numbers[kind]
-    points = numbers.points(ends_of(kit.cell, arm, from_mm, to_mm), size * uniform(150, numbers.count))
+    points = numbers.points(ends_of(kit.cell, arm, from_mm, to_mm), size * uniform(100, numbers.count))
     worst, _ = assert_same_verdicts(kit, arm, from_mm, to_mm, points)
     if kind == "offset" and size == 0.1:
         assert 0.1 < (worst >= 0).mean() < 0.9
