@@ -1,18 +1,24 @@
-"""Put the results of suites into docs/results.md: ``python scripts/results_docs.py [OUT ...]``.
+"""Put the results of suites into docs/results.md: ``python scripts/results_docs.py [partial=true] [OUT ...]``.
 
-Each OUT, the folder of a finished ``marl-handover compare``, is stored as evidence under bench/results/compare first.
+Each OUT, the folder of a finished ``marl-handover compare``, is stored as evidence under bench/results/compare first. With ``partial=true``
+one that does not have all rows and seeds yet is taken, too, and the page says so.
 """
 
 import sys
 from pathlib import Path
 
 from marl_handover.compare.docs import filled, read_evidence, store_evidence
+from marl_handover.errors import HandoverError
 
 ROOT = Path(__file__).resolve().parents[1]
 EVIDENCE, PAGE, PICTURES = ROOT / "bench" / "results" / "compare", ROOT / "docs" / "results.md", "../bench/results/compare"
+PARTIAL = "partial=true"
 
 if __name__ == "__main__":
-    for out in sys.argv[1:]:
-        print(f"stored: {store_evidence(Path(out), EVIDENCE)}")
+    try:
+        for out in (argument for argument in sys.argv[1:] if argument != PARTIAL):
+            print(f"stored: {store_evidence(Path(out), EVIDENCE, partial=PARTIAL in sys.argv[1:])}")
+    except HandoverError as error:
+        sys.exit(str(error))
     PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), read_evidence(EVIDENCE), PICTURES), encoding="utf-8")
     print(f"written: {PAGE}")

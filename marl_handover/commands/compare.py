@@ -45,79 +45,112 @@ def run(config: CompareConfig) -> int:
         WorkFailed: some tasks failed; the others are done and reported.
     """
     from marl_handover.commands import evaluate, train
-    from marl_handover.compare.runs import Grammar, check_unchanged, plan_tasks
+    from marl_handover.compare.plan import Grammar, plan_tasks
+    from marl_handover.compare.runs import check_unchanged
     from marl_handover.compare.statistics import require_statistics
     from marl_handover.compare.suite import load_suite
 
     require_statistics()
-    suite = load_suite(config.suite).sized(config.preset).with_rows(config.rows)
+    whole = load_suite(config.suite).sized(config.preset)
+    suite = whole.with_rows(config.rows)
     if config.seeds:
         suite = suite.with_seeds(config.seeds)
-    _check_fresh(suite, config.fresh)
-    out = Path(config.out or f"runs/compare/{suite.name}{'' if suite.size == 'full' else '-' + suite.size}")
+    _check(config, suite)
+    out = Path(config.out or f"runs/compare/{suite.name}{'' if suite.size == 'full' else '-' + suite.size}").expanduser().absolute()
     if out.exists() and not out.is_dir():
         raise InvalidSetting("out", str(out), "a folder; this is a file")
     tasks = plan_tasks(suite, out, Grammar(train.ALIASES, train.GROUPS), Grammar(evaluate.ALIASES, evaluate.GROUPS))
     for task in tasks:
         check_unchanged(task, config.fresh)
-    failures = {} if config.report_only else _run_tasks(config, tasks)
-    _report(suite, tasks, failures, out)
-    if failures:
-        told = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
-        raise WorkFailed(f"{len(failures)} of {len(tasks)} runs failed, the others are done and reported: {told}")
+    failures, others = ({}, []) if config.report_only else _run_tasks(config, tasks)
+    results = _report(suite, whole, tasks, failures, out)
+    _require_done(results, len(tasks), others, config.report_only)
     return 0
 
 
-def _check_fresh(suite: Suite, fresh: Sequence[str]) -> None:
-    rows = [row.name for row in suite.rows]
-    known = rows + [f"{row}/{spec.name}" for row in rows for spec in suite.evaluations]
-    for name in fresh:
+def _check(config: CompareConfig, suite: Suite) -> None:
+    """Refuse keys that name nothing, or that nothing would look at."""
+    known = [row.name for row in suite.rows]
+    for row in suite.rows:
+        specs = [spec for seed in suite.seeds_of(row) for spec in suite.evaluations_of(row, seed)]
+        known += dict.fromkeys(f"{row.name}/{spec.name}" for spec in specs)
+    for name in config.fresh:
         if name not in known:
             raise UnknownChoice("fresh", name, known)
+    if config.report_only and config.fresh:
+        raise InvalidSetting("fresh", config.fresh, "left out with report_only=true, which makes nothing anew")
+    if config.address and config.launcher == "loky":
+        raise InvalidSetting("address", config.address, "left out with launcher=loky; it is that of a Ray cluster")
 
 
-def _run_tasks(config: CompareConfig, tasks: Sequence[Task]) -> dict[str, str]:
-    """Run what is not finished; name and reason of what failed."""
+def _require_done(results: dict[str, Any], tasks: int, others: Sequence[str], report_only: bool) -> None:
+    """Raise :class:`WorkFailed` that tells what failed, what another call is at, and what is not done for no known reason."""
+    failures = results["failures"]
+    told = [f"{name}: {reason}" for name, reason in failures.items()]
+    if failures:
+        raise WorkFailed(f"{len(failures)} of {tasks} runs failed, the others are reported: {'; '.join(told)}")
+    if report_only:
+        return
+    if left := [name for name in others if name in results["missing"]]:
+        raise WorkFailed(f"another call is at work at {', '.join(left)}; call again when it is done")
+    if results["missing"]:
+        raise WorkFailed(f"not done, though no worker failed: {', '.join(results['missing'])}; do all machines share out=?")
+
+
+def _run_tasks(config: CompareConfig, tasks: Sequence[Task]) -> tuple[dict[str, str], list[str]]:
+    """Run what is not finished; name and reason of what failed, and names of what another call is at."""
     from marl_handover.compare.launch import Failure, fan_out
-    from marl_handover.compare.runs import clear, execute, finished
+    from marl_handover.compare.runs import clear_all, execute, finished
 
-    for task in tasks:
-        clear(task, config.fresh)
+    clear_all(tasks, config.fresh)
     todo = [task for task in tasks if not finished(task)]
     if len(todo) < len(tasks):
         print(f"{len(tasks) - len(todo)} of {len(tasks)} runs are done already", file=sys.stderr)
-    failures = {}
+    failures, others = {}, []
     options: dict[str, Any] = {"launcher": config.launcher, "address": config.address, "jobs": config.jobs, "progress": config.progress}
     for task, result in fan_out(execute, todo, label=lambda task: task.name, **options):
         if isinstance(result, Failure):
             failures[task.name] = result.error
-    return failures
+        elif not result:
+            others.append(task.name)
+    return failures, others
 
 
-def _report(suite: Suite, tasks: Sequence[Task], failures: dict[str, str], out: Path) -> None:
-    """Write all numbers, tables and figures; print the tables."""
+def _report(suite: Suite, whole: Suite, tasks: Sequence[Task], failures: dict[str, str], out: Path) -> dict[str, Any]:
+    """Write all numbers, tables and figures; print the tables. What an earlier report left and this one does not have goes away."""
     from marl_handover.compare.results import gather
     from marl_handover.compare.tables import csv_text, make_tables, markdown
     from marl_handover.learning.recorder import write_whole
     from marl_handover.report.compare import make_figures
     from marl_handover.report.files import save_figure, write_json
 
-    results = gather(suite, tasks, failures)
+    results = gather(suite, tasks, failures, whole)
+    figures = dict(make_figures(results))
+    results["empty_figures"] = [name for name, figure in figures.items() if figure is None]
     write_json(out / "results.json", results, "out")
+    tables = make_tables(results)
     (out / "tables").mkdir(exist_ok=True)
-    for table in make_tables(results):
+    for table in tables:
         write_whole(out / "tables" / f"{table.name}.md", markdown(table))
         write_whole(out / "tables" / f"{table.name}.csv", csv_text(table))
         print(f"{table.title}\n\n{markdown(table)}")
-    empty = []
-    for name, figure in make_figures(results):
-        if figure is None:
-            empty.append(name)
-            continue
+    drawn = {name: figure for name, figure in figures.items() if figure is not None}
+    for name, figure in drawn.items():
         for suffix in ("png", "pdf"):
             save_figure(figure, out / "figures" / f"{name}.{suffix}")
+    _remove_old(out / "tables", [table.name for table in tables], (".md", ".csv"))
+    _remove_old(out / "figures", list(drawn), (".png", ".pdf"))
     if results["missing"]:
         print(f"not done yet: {', '.join(results['missing'])}")
-    if empty:
-        print(f"no values yet for the figures: {', '.join(empty)}")
+    if results["empty_figures"]:
+        print(f"no values yet for the figures: {', '.join(results['empty_figures'])}")
+    if results["partial"]:
+        print("partial: results.json says under progress how much of the suite this is")
     print(f"written: {out / 'results.json'}, {out / 'tables'}, {out / 'figures'}")
+    return results
+
+
+def _remove_old(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> None:
+    for path in folder.glob("*") if folder.is_dir() else ():
+        if path.suffix in suffixes and path.stem not in names:
+            path.unlink()

@@ -6,45 +6,50 @@ import importlib
 import importlib.util
 import os
 import platform
+import re
 import shutil
 import sys
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Any
 
-CORE = (
-    "numpy",
-    "torch",
-    "torchrl",
-    "tensordict",
-    "gymnasium",
-    "pettingzoo",
-    "scipy",
-    "hydra-core",
-    "omegaconf",
-    "matplotlib",
-    "tensorboard",
-    "tqdm",
-    "numba",
-    "pybullet",
-    "pillow",
-    "imageio",
-    "imageio-ffmpeg",
-    "joblib",
-    "optuna",
-    "opencv-python-headless",
-    "pyserial",
-)
-EXTRAS = {
-    "compare": ("rliable", "pandas"),
-    "ray": ("ray",),
-    "realsense": ("pyrealsense2",),
-    "peers": ("stable-baselines3",),
-    "ompl": ("ompl",),
-    "dev": ("pytest", "ruff", "mypy", "import-linter", "toppra"),
-}
+PACKAGE = "marl_handover"
+
+
+def _wanted() -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
+    """Packages that the core needs and those of each extra, as the checkout's pyproject.toml or the installed package's metadata has them.
+
+    An editable install's metadata is as old as the install, so the checkout goes first.
+    """
+    file = Path(__file__).resolve().parents[2] / "pyproject.toml"
+    if file.is_file():
+        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
+        extras = project.get("optional-dependencies", {})
+        return _names(project["dependencies"]), {extra: _names(lines) for extra, lines in extras.items()}
+    with suppress(PackageNotFoundError):
+        return _sorted_out(requires(PACKAGE) or [])
+    return (), {}
+
+
+def _sorted_out(requirements: Iterable[str]) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
+    """Packages of the core and of each extra, from the lines of a package's metadata."""
+    by_extra: dict[str, list[str]] = {}
+    for line in requirements:
+        found = re.search(r"extra\s*==\s*['\"]([^'\"]+)", line)
+        by_extra.setdefault(found[1] if found else "", []).append(line)
+    return _names(by_extra.pop("", [])), {extra: _names(lines) for extra, lines in by_extra.items()}
+
+
+def _names(requirements: Iterable[str]) -> tuple[str, ...]:
+    """Their packages, without versions and conditions."""
+    return tuple(re.split(r"[^\w.-]", line.strip(), maxsplit=1)[0] for line in requirements)
+
+
+CORE, EXTRAS = _wanted()
 
 
 @dataclass
@@ -88,11 +93,11 @@ def _installed(package: str) -> str | None:
 
 def _packages(packages: tuple[str, ...]) -> Iterator[str]:
     for package in packages:
-        yield f"{package:<23} {_installed(package) or 'MISSING'}"
+        yield f"{package:<27} {_installed(package) or 'MISSING'}"
 
 
 def _system() -> Iterator[str]:
-    yield f"marl_handover  {_installed('marl_handover') or 'not installed (running from a checkout)'}"
+    yield f"marl_handover  {_installed(PACKAGE) or 'not installed (running from a checkout)'}"
     yield f"python         {platform.python_version()} ({sys.executable})"
     yield f"platform       {platform.platform()}"
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()

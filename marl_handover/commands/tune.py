@@ -76,6 +76,8 @@ def _search(config: TuneConfig) -> tuple[Search, Path]:
     require_choice("launcher", config.launcher, LAUNCHERS)
     require_at_least("trials", config.trials, 1)
     require_at_least("jobs", config.jobs, 0)
+    if config.address and config.launcher == "loky":
+        raise InvalidSetting("address", config.address, "left out with launcher=loky; it is that of a Ray cluster")
     if config.resume:
         raise InvalidSetting("resume", config.resume, "left empty; a study continues by itself")
     settings = TrainConfig(**{item.name: getattr(config, item.name) for item in fields(TrainConfig)})

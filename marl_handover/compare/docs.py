@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +28,14 @@ class UnknownBlock(HandoverError):
     def __init__(self, kind: str, suite: str, name: str) -> None:
         super().__init__(f"the page asks for the {kind} {name!r} of suite {suite!r}, which its stored results do not have")
         self.kind, self.suite, self.name = kind, suite, name
+
+
+class UnfitEvidence(HandoverError):
+    """Results that the page must not show."""
+
+    def __init__(self, out: Path, reason: str) -> None:
+        super().__init__(f"{out}: {reason}")
+        self.out, self.reason = out, reason
 
 
 class Block(NamedTuple):
@@ -62,41 +71,85 @@ def filled(page: str, evidence: Mapping[str, Mapping[str, Any]], pictures: str) 
 
     def replaced(match: re.Match[str]) -> str:
         kind, suite, name = match[2], match[3], match[4]
-        content = f"\n{NOT_RUN}\n\n"
+        content = NOT_RUN + "\n"
         if suite in evidence:
-            content = "\n" + (_table if kind == "table" else _figure)(evidence[suite], suite, name, pictures) + "\n"
-        return match[1] + content + match[6]
+            results = evidence[suite]
+            shown = _table(results, suite, name) if kind == "table" else _figure(results, suite, name, pictures)
+            content = (partial_line(results) + "\n\n" if results["partial"] else "") + shown
+        return match[1] + "\n" + content + "\n" + match[6]
 
     return _BLOCK.sub(replaced, page)
 
 
-def _table(results: Mapping[str, Any], suite: str, name: str, pictures: str) -> str:
+def partial_line(results: Mapping[str, Any]) -> str:
+    """How many seeds of which rows partial results have: ``2 of 5 seeds so far: ...``."""
+    groups: dict[str, list[str]] = {}
+    for part in results["progress"]:
+        groups.setdefault(f"{part['done']} of {part['of']} seeds so far", []).append(f"*{part['label']}*")
+    return "Partial: " + "; ".join(f"{count}: {', '.join(labels)}" for count, labels in groups.items()) + "."
+
+
+def _table(results: Mapping[str, Any], suite: str, name: str) -> str:
     for table in make_tables(results):
         if table.name == name:
             return markdown(table)
+    if results["partial"] and name in [spec["name"] for spec in results["tables"]]:
+        return NOT_RUN + "\n"
     raise UnknownBlock("table", suite, name)
 
 
 def _figure(results: Mapping[str, Any], suite: str, name: str, pictures: str) -> str:
     for spec in results["figures"]:
         if spec["name"] == name:
-            return f"![{spec['title'] or name}]({pictures}/{suite}/figures/{name}.png)\n"
+            return (
+                NOT_RUN + "\n"
+                if name in results["empty_figures"]
+                else f"![{spec['title'] or name}]({pictures}/{suite}/figures/{name}.png)\n"
+            )
     raise UnknownBlock("figure", suite, name)
 
 
-def store_evidence(out: Path, folder: Path) -> Path:
-    """Copy what the page needs of a suite's results from ``out`` into ``folder``/SUITE; returns that folder.
+def store_evidence(out: Path, folder: Path, partial: bool = False) -> Path:
+    """Put what the page needs of a suite's results from ``out`` in place of what ``folder``/SUITE holds; returns that folder.
+
+    Args:
+        out: folder that ``compare`` filled.
+        folder: of all evidence.
+        partial: take results that do not have all rows and seeds of the suite, too.
 
     Raises:
         MissingFile, CorruptFile: ``out`` holds no results.
+        UnfitEvidence: they are partial, of the smoke size, have failures, or their tables or pictures are not all there.
     """
     results = read_json(out / RESULTS, "results")
+    files = _required(results, out, partial)
     home = folder / str(results["suite"])
-    for part in ("tables", "figures"):
-        shutil.rmtree(home / part, ignore_errors=True)
-        (home / part).mkdir(parents=True)
-        for path in sorted((out / part).iterdir()):
-            if path.suffix in (".csv", ".md", ".png"):
-                shutil.copy(path, home / part / path.name)
-    shutil.copy(out / RESULTS, home / RESULTS)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as temporary:
+        new = Path(temporary) / home.name
+        for name in files:
+            (new / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(out / name, new / name)
+        if home.exists():
+            home.rename(Path(temporary) / "old")
+        new.rename(home)
     return home
+
+
+def _required(results: Mapping[str, Any], out: Path, partial: bool) -> list[str]:
+    """The files to keep, all of them there."""
+    again = "make them again with report_only=true"
+    if not {"partial", "progress", "empty_figures"} <= set(results):
+        raise UnfitEvidence(out, f"its results are of an older version; {again}")
+    if results["size"] != "full":
+        raise UnfitEvidence(out, f"its results are of the size {results['size']}")
+    if results["failures"]:
+        raise UnfitEvidence(out, f"its results have failures: {', '.join(results['failures'])}")
+    if results["partial"] and not partial:
+        raise UnfitEvidence(out, f"its results are not the whole suite ({partial_line(results)}); partial=true takes them all the same")
+    tables = [f"tables/{table.name}.{suffix}" for table in make_tables(results) for suffix in ("md", "csv")]
+    drawn = [spec["name"] for spec in results["figures"] if spec["name"] not in results["empty_figures"]]
+    files = [RESULTS, *tables, *(f"figures/{name}.png" for name in drawn)]
+    if lacking := [name for name in files if not (out / name).is_file()]:
+        raise UnfitEvidence(out, f"it lacks {', '.join(lacking)}; {again}")
+    return files

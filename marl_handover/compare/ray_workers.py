@@ -28,10 +28,11 @@ PROBE_S = 5.0
 
 
 class ClusterUnavailable(WorkFailed):
-    """No Ray cluster answers at an address."""
+    """No Ray cluster can be used at an address. ``absent``: nothing answers there, so that starting one may help."""
 
-    def __init__(self, address: str, reason: str) -> None:
-        super().__init__(f"no Ray cluster at address={address}: {reason}; start one with: ray start --head")
+    def __init__(self, address: str, reason: str, absent: bool = True) -> None:
+        advice = "; start one with: ray start --head" if absent else ""
+        super().__init__(f"no Ray cluster at address={address}: {reason}{advice}")
         self.address, self.reason = address, reason
 
 
@@ -157,11 +158,20 @@ def _cluster(ray: Any, address: str, jobs: int) -> Iterator[Any]:
     except ValueError as error:
         raise InvalidSetting("address", address, f"auto, local, host:port or ray://host:port ({summary(error)})") from error
     except (ConnectionError, RuntimeError, SystemExit) as error:
-        raise ClusterUnavailable(address, " ".join(str(error).split()).partition(". ")[0] or "it does not answer") from error
+        alone = error.__cause__ is None and error.__context__ is None
+        raise ClusterUnavailable(address, _root_cause(error), absent=alone and isinstance(error, ConnectionError)) from error
     try:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _root_cause(error: BaseException) -> str:
+    """First line of the error that all others came of: Ray wraps what happened, a version that does not fit say, in advice to start Ray."""
+    while (deeper := error.__cause__ or error.__context__) is not None:
+        error = deeper
+    lines = [" ".join(line.split()).rstrip(".") for line in str(error).splitlines() if line.strip()]
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def _probe(address: str) -> None:

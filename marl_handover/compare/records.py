@@ -16,11 +16,28 @@ from marl_handover.learning.recorder import write_whole
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.resources import package_path
 from marl_handover.runtime.assessment import AssessmentConfig
+from marl_handover.task.rules import Outcome
 
 PLACES = ("out", "resume", "progress", "policy")
 """Settings that say where something is, not what it is."""
 
 Settings = dict[str, Any]
+Needed = Mapping[str, type | tuple[type, ...]]
+
+_NUMBER = (int, float)
+_MADE_BY: Needed = {"config_hash": str, "commit": str, "machine": dict}
+
+# Dotted keys that a record is of no use without.
+ASKED_KEYS: Needed = {"commit": str, "settings": dict}
+TRAINED_KEYS: Needed = {**_MADE_BY, "step": int, "gradient_step": int, "wall_s": _NUMBER}
+REPORT_KEYS: Needed = {
+    **{key: _NUMBER for key in ("success_rate", "mean_steps", "wall_s")},
+    **{f"outcomes.{kind.name.lower()}": int for kind in Outcome if kind is not Outcome.NONE},
+    **{f"provenance.{key}": kind for key, kind in {**_MADE_BY, "policy": str, "settings": dict}.items()},
+    "episodes": int,
+    "backend": str,
+}
+DONE_KEYS: Needed = {"row": str, "seed": int, "evaluations": dict}
 
 
 def settings_of(config: TrainConfig | AssessmentConfig) -> Settings:
@@ -49,13 +66,30 @@ def usual_settings(config: TrainConfig | AssessmentConfig) -> Settings:
     return settings_of(usual)
 
 
-def read_record(path: Path) -> dict[str, Any] | None:
-    """A JSON file of a task's folder; None if it is not there or not whole (records are written as a whole, so then nobody finished it)."""
+def read_record(path: Path, needed: Needed | None = None) -> dict[str, Any] | None:
+    """A JSON file of a task's folder; None if it is not there, not whole, or lacks a key of ``needed`` or has one of another type.
+
+    Records are written as a whole, so that a damaged one is as good as none: what it told is made again.
+    """
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return record if isinstance(record, dict) else None
+    if not isinstance(record, dict):
+        return None
+    return record if all(isinstance(_value(record, key), kind) for key, kind in (needed or {}).items()) else None
+
+
+def _value(tree: Any, key: str) -> Any:
+    """What stands at a dotted key; None if nothing does."""
+    for name in key.split("."):
+        tree = tree.get(name) if isinstance(tree, dict) else None
+    return tree
+
+
+def commits_of(record: Mapping[str, Any]) -> list[str]:
+    """All commits that a training ran under; a record from before these were kept has its one."""
+    return list(record.get("commits", [record["commit"]]))
 
 
 def write_record(path: Path, content: Mapping[str, Any]) -> None:

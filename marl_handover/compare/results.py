@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.compare import statistics
-from marl_handover.compare.records import fingerprint, read_record, settings_of
+from marl_handover.compare.records import REPORT_KEYS, TRAINED_KEYS, commits_of, fingerprint, read_record, settings_of
 from marl_handover.compare.runs import RUN_FOLDER, TRAINED, Task
-from marl_handover.compare.suite import BAR_MEASURES, RowSpec, Suite
+from marl_handover.compare.suite import RowSpec, Suite
+from marl_handover.compare.suite_check import BAR_MEASURES
+from marl_handover.errors import HandoverError
 from marl_handover.report.metrics import Metrics, common_curve, read_metrics
 from marl_handover.task.rules import Outcome
 
@@ -30,38 +32,63 @@ COMPARED_LEVEL = 0.95
 THRESHOLDS = 101
 
 
-def gather(suite: Suite, tasks: Sequence[Task], failures: Mapping[str, str]) -> Tree:
+def gather(suite: Suite, tasks: Sequence[Task], failures: Mapping[str, str], whole: Suite | None = None) -> Tree:
     """Read what the tasks left, and compute the statistics.
+
+    A run that cannot be read is left out and told as failed.
 
     Args:
         suite: what was asked.
         tasks: of that suite.
         failures: name of a task -> what went wrong.
+        whole: the suite before rows and seeds were chosen from it; what it has beyond ``suite``, or is not done, makes the results partial.
     """
-    rows, missing = [], []
+    rows, missing, failed = [], [], dict(failures)
     for row in suite.rows:
+        runs = []
+        for task in (task for task in tasks if task.row == row.name):
+            try:
+                run = _run(task, suite)
+            except HandoverError as error:
+                failed.setdefault(task.name, f"cannot be read: {error}; fresh=[{task.row}] makes it anew")
+                run = {"seed": task.seed, "trained": None, "evaluations": {}}
+            run["whole"] = not _unfinished(task, run)
+            missing += [] if run["whole"] else [task.name]
+            runs.append(run)
         own = [task for task in tasks if task.row == row.name]
-        runs = [_run(task, suite) for task in own]
-        missing += [task.name for task, run in zip(own, runs, strict=True) if _unfinished(task, run)]
         rows.append(_row(suite, row, own, [run for run in runs if run["trained"] or run["evaluations"]]))
+    progress = _progress(whole or suite, rows)
     content = {
         "suite": suite.name,
         "title": suite.title,
         "size": suite.size,
+        "partial": any(part["done"] < part["of"] for part in progress),
+        "progress": progress,
         "written": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "commits": _distinct("commit", rows),
-        "machines": _distinct("machine", rows),
+        "commits": _commits(rows),
+        "machines": _machines(rows),
         "interval": {"coverage": statistics.COVERAGE, "repetitions": statistics.REPETITIONS, "estimator": "interquartile mean"},
         "rows": rows,
         "evaluations": [asdict(spec) for spec in suite.evaluations],
         "figures": [asdict(spec) for spec in suite.figures],
         "tables": [asdict(spec) for spec in suite.tables],
         "missing": missing,
-        "failures": dict(failures),
+        "failures": failed,
     }
     content["comparisons"] = _comparisons(content)
     content["profiles"] = {spec.name: _profiles(content, spec.rows, spec.evaluations) for spec in suite.figures if spec.kind == "profiles"}
     return content
+
+
+def _progress(whole: Suite, rows: Sequence[Tree]) -> list[Tree]:
+    """Of each row of the whole suite, which of its seeds are done, of how many."""
+    done = {row["name"]: [run["seed"] for run in row["runs"] if run["whole"]] for row in rows}
+    found = []
+    for row in whole.rows:
+        seeds = [seed for seed in done.get(row.name, []) if seed in whole.seeds_of(row)]
+        about = {"row": row.name, "label": row.label or row.name, "seeds": seeds}
+        found.append({**about, "done": len(seeds), "of": len(whole.seeds_of(row))})
+    return found
 
 
 def measure_scores(row: Tree, evaluation: str, measure: str) -> list[float]:
@@ -72,10 +99,10 @@ def measure_scores(row: Tree, evaluation: str, measure: str) -> list[float]:
 
 def _run(task: Task, suite: Suite) -> Tree:
     """One task's numbers; what is not there yet is left out."""
-    trained = read_record(task.folder / TRAINED)
+    trained = None if task.train is None else read_record(task.folder / TRAINED, TRAINED_KEYS)
     evaluations = {}
     for judgement in task.judgements:
-        report = read_record(task.folder / f"{judgement.name}.json")
+        report = read_record(task.folder / f"{judgement.name}.json", REPORT_KEYS)
         if report is not None:
             about = report.pop("provenance")
             evaluations[judgement.name] = {**report, "policy": about["policy"], "commit": about["commit"], "machine": about["machine"]}
@@ -118,8 +145,8 @@ def _row(suite: Suite, row: RowSpec, tasks: Sequence[Task], runs: list[Tree]) ->
 def _evaluation(row: Tree, name: str) -> Tree:
     """One evaluation over the runs: each measure, and all endings."""
     reports = [run["evaluations"][name] for run in row["runs"] if name in run["evaluations"]]
-    found: Tree = {"runs": len(reports), "episodes": sum(report["episodes"] for report in reports)}
-    found["backend"] = reports[0]["backend"]
+    found: Tree = {"runs": len(reports), "true_coverage": statistics.true_coverage(len(reports))}
+    found |= {"episodes": sum(report["episodes"] for report in reports), "backend": reports[0]["backend"]}
     found["outcomes"] = {key: sum(report["outcomes"][key] for report in reports) for key in _endings()}
     columns = {measure: np.array(scores) for measure in BAR_MEASURES if (scores := measure_scores(row, name, measure))}
     for runs in sorted({len(scores) for scores in columns.values()}):
@@ -178,12 +205,21 @@ def _comparisons(content: Tree) -> list[Tree]:
 
 
 def _sooner(first: Tree, second: Tree) -> Tree | None:
-    """Probability that a run of the first row is at the level with fewer transfers than one of the second."""
+    """Probability that a run of the first row is at the level with fewer transfers than one of the second.
+
+    What happened after the end of the shorter training is left out, as the other row was not watched for so long: two runs of which
+    neither was there by then are a tie.
+    """
+    if first["settings"] is None or second["settings"] is None:
+        return None
+    until = min(row["settings"]["steps"] for row in (first, second))
     costs = []
     for row in (first, second):
         found = _costs([_arrays(run["metrics"]) for run in row["runs"] if "metrics" in run], COMPARED_LEVEL)
-        costs.append(np.array([[-NEVER if cost is None else -cost] for cost in found]))
-    return statistics.improvement(*costs)._asdict() if all(len(column) for column in costs) else None
+        # The last validation may lie a few transfers after the end that was asked for.
+        ended = [NEVER if cost is None else min(cost, row["settings"]["steps"]) for cost in found]
+        costs.append(np.array([[-NEVER if cost > until else -cost] for cost in ended]))
+    return {**statistics.improvement(*costs)._asdict(), "until_step": until} if all(len(column) for column in costs) else None
 
 
 def _profiles(content: Tree, rows: Sequence[str], evaluations: Sequence[str]) -> Tree:
@@ -204,14 +240,20 @@ def _profiles(content: Tree, rows: Sequence[str], evaluations: Sequence[str]) ->
     return {"thresholds": thresholds.tolist(), "rows": lists}
 
 
-def _distinct(key: str, rows: Sequence[Tree]) -> list[Any]:
-    """The values of ``key`` over all trainings and evaluations, each once."""
-    found = []
-    for row in rows:
-        for run in row["runs"]:
-            for part in (run["trained"], *run["evaluations"].values()):
-                if part is not None and part[key] not in found:
-                    found.append(part[key])
+def _commits(rows: Sequence[Tree]) -> list[str]:
+    """All commits under which something was trained or judged."""
+    runs = [run for row in rows for run in row["runs"]]
+    trained = [commit for run in runs if run["trained"] for commit in commits_of(run["trained"])]
+    return list(dict.fromkeys([*trained, *(report["commit"] for run in runs for report in run["evaluations"].values())]))
+
+
+def _machines(rows: Sequence[Tree]) -> list[Tree]:
+    """All machines on which something was trained or judged."""
+    found: list[Tree] = []
+    for run in (run for row in rows for run in row["runs"]):
+        for part in (run["trained"], *run["evaluations"].values()):
+            if part is not None and part["machine"] not in found:
+                found.append(part["machine"])
     return found
 
 

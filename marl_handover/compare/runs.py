@@ -2,7 +2,8 @@
 
 A task is one seed of one row. Its folder ``<out>/<row>/seed<k>`` holds ``task.json`` (what was asked), the run directory ``run``,
 ``trained.json``, one ``<evaluation>.json`` each, and at last ``done.json``. Whatever of these is there is not made again, so a suite
-that was interrupted goes on where it stopped. A task whose settings have changed since is refused by name.
+that was interrupted goes on where it stopped, and a damaged record is made again. A task whose settings have changed since is refused by
+name. Only one call at a time works at a task: ``seed<k>.lock`` beside its folder is locked meanwhile.
 """
 
 from __future__ import annotations
@@ -11,34 +12,27 @@ import logging
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
-from marl_handover.compare.records import commit, fingerprint, machine, read_record, settings_of, usual_settings, write_record
-from marl_handover.compare.suite import EVALUATION_SEED_OFFSET, RUN, RowSpec, Suite
-from marl_handover.compose import compose
-from marl_handover.compose_schema import Groups
+from marl_handover.compare import records
+from marl_handover.compare.locks import held
+from marl_handover.compare.records import fingerprint, read_record, settings_of, write_record
 from marl_handover.errors import HandoverError, WorkFailed
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.runtime.assessment import AssessmentConfig
 
 ASKED, TRAINED, DONE, RUN_FOLDER = "task.json", "trained.json", "done.json", "run"
 
-Config = TypeVar("Config", TrainConfig, AssessmentConfig)
-
-
-class Grammar(NamedTuple):
-    """What the arguments of a command may say beyond its schema: short keys, and options that are code."""
-
-    aliases: Mapping[str, str]
-    groups: Groups
+GRACE_S = 20.0
+"""So long a task waits for its lock: a worker whose machine has left the cluster may live on for some seconds."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """One evaluation of a task. ``policy`` is as the suite has it, with :data:`RUN` for the run directory."""
+    """One evaluation of a task. ``policy`` is as the suite has it, with ``{run}`` for the run directory."""
 
     name: str
     config: AssessmentConfig
@@ -48,7 +42,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Task:
-    """One seed of one row. ``train`` is None for a row that is not trained."""
+    """One seed of one row. ``train`` is None for a row that is not trained; ``commit`` is that of the call."""
 
     row: str
     seed: int
@@ -56,6 +50,7 @@ class Task:
     train: TrainConfig | None
     arguments: tuple[str, ...]
     judgements: tuple[Judgement, ...]
+    commit: str
 
     @property
     def name(self) -> str:
@@ -78,61 +73,12 @@ class IncompleteTask(WorkFailed):
     """A part of a task went wrong; the others are done."""
 
 
-def plan_tasks(suite: Suite, out: Path, train: Grammar, evaluate: Grammar) -> list[Task]:
-    """Every task of the suite, row by row, with all settings composed and checked.
+class Busy(WorkFailed):
+    """Another call is at work at a task whose results were to be thrown away."""
 
-    Args:
-        suite: what to do.
-        out: folder of all results.
-        train: what arguments of ``train`` may say.
-        evaluate: what arguments of ``evaluate`` may say.
-
-    Raises:
-        HandoverError: bad settings; the message names the row.
-    """
-    tasks: list[Task] = []
-    for row in suite.rows:
-        try:
-            tasks += _row_tasks(suite, row, out, train, evaluate)
-        except HandoverError as error:
-            raise BadRow(row.name, error) from error
-    return tasks
-
-
-def _row_tasks(suite: Suite, row: RowSpec, out: Path, train: Grammar, evaluate: Grammar) -> list[Task]:
-    """A row's tasks. Settings are composed once and differ in seed and place."""
-    arguments = () if row.train is None else tuple(suite.train_arguments(row))
-    config = None if row.train is None else _composed(TrainConfig, arguments, train)
-    asked = {}
-    for spec in suite.evaluations_of(row, 0):
-        wanted = tuple(suite.evaluate_arguments(row, spec))
-        asked[spec.name] = Judgement(spec.name, _composed(AssessmentConfig, wanted, evaluate), wanted, suite.policy_of(row, spec))
-    tasks = []
-    for seed in suite.seeds_of(row):
-        folder = out / row.name / f"seed{seed}"
-        run = str(folder / RUN_FOLDER)
-        judgements = []
-        for judgement in (asked[spec.name] for spec in suite.evaluations_of(row, seed)):
-            policy = judgement.policy.replace(RUN, run)
-            own = replace(deepcopy(judgement.config), policy=policy, seed=EVALUATION_SEED_OFFSET + seed)
-            judgements.append(replace(judgement, config=own))
-        placed = None if config is None else replace(deepcopy(config), seed=seed, out=run, progress=False)
-        tasks.append(Task(row.name, seed, folder, placed, arguments, tuple(judgements)))
-    return tasks
-
-
-class BadRow(HandoverError):
-    """A row whose settings do not hold."""
-
-    def __init__(self, row: str, error: HandoverError) -> None:
-        super().__init__(f"row {row}: {error}")
-        self.row = row
-
-
-def _composed(schema: type[Config], arguments: Sequence[str], grammar: Grammar) -> Config:
-    config: Config = compose(schema, arguments, groups=grammar.groups, aliases=grammar.aliases)
-    config.validate()
-    return config
+    def __init__(self, task: Task) -> None:
+        super().__init__(f"fresh: another call is at work at {task.name}; nothing was thrown away")
+        self.task = task
 
 
 def check_unchanged(task: Task, fresh: Sequence[str] = ()) -> None:
@@ -146,25 +92,45 @@ def check_unchanged(task: Task, fresh: Sequence[str] = ()) -> None:
     if task.row in fresh:
         return
     if task.train is not None:
-        _compare(task.folder / ASKED, task.train, f"row {task.row}", task.row)
+        _compare_training(task, task.train)
     for judgement in task.judgements:
         name = f"{task.row}/{judgement.name}"
-        if name not in fresh:
-            _compare(task.folder / f"{judgement.name}.json", judgement.config, f"evaluation {name}", name, judgement.policy)
+        path = task.folder / f"{judgement.name}.json"
+        report = None if name in fresh else read_record(path, records.REPORT_KEYS)
+        if report is not None:
+            about = report["provenance"]
+            if about["policy"] != judgement.policy:
+                raise ChangedRow(path, f"evaluation {name}", "policy", about["policy"], judgement.policy, name)
+            _compare(path, about["settings"], judgement.config, f"evaluation {name}", name)
 
 
-def _compare(path: Path, config: TrainConfig | AssessmentConfig, what: str, fresh: str, policy: str | None = None) -> None:
-    stored = read_record(path)
-    if stored is None:
-        return
-    about = stored if policy is None else stored["provenance"]
-    if policy is not None and about["policy"] != policy:
-        raise ChangedRow(path, what, "policy", about["policy"], policy, fresh)
-    usual = usual_settings(config)
+def _compare_training(task: Task, config: TrainConfig) -> None:
+    asked = read_record(task.folder / ASKED, records.ASKED_KEYS)
+    if asked is not None:
+        _compare(task.folder / ASKED, asked["settings"], config, f"row {task.row}", task.row)
+    elif trained := read_record(task.folder / TRAINED, records.TRAINED_KEYS):
+        now = fingerprint(settings_of(config))
+        if trained["config_hash"] != now:
+            raise ChangedRow(task.folder / TRAINED, f"row {task.row}", "config_hash", trained["config_hash"], now, task.row)
+
+
+def _compare(path: Path, stored: Mapping[str, Any], config: TrainConfig | AssessmentConfig, what: str, fresh: str) -> None:
+    usual = records.usual_settings(config)
     for key, value in settings_of(config).items():
-        before = about["settings"].get(key, usual.get(key))
+        before = stored.get(key, usual.get(key))
         if before != value:
             raise ChangedRow(path, what, key, before, value, fresh)
+
+
+def clear_all(tasks: Sequence[Task], fresh: Sequence[str]) -> None:
+    """Throw away what ``fresh`` names of the tasks. Raises :class:`Busy`, before anything is, if another call is at one of them."""
+    named = [task for task in tasks if any(name.partition("/")[0] == task.row for name in fresh)]
+    with ExitStack() as locks:
+        for task in named:
+            if not locks.enter_context(held(task.folder)):
+                raise Busy(task)
+        for task in named:
+            clear(task, fresh)
 
 
 def clear(task: Task, fresh: Sequence[str]) -> None:
@@ -178,25 +144,36 @@ def clear(task: Task, fresh: Sequence[str]) -> None:
 
 
 def finished(task: Task) -> bool:
-    """Whether nothing is left to do."""
-    names = [f"{judgement.name}.json" for judgement in task.judgements] + [DONE]
-    return all((task.folder / name).is_file() for name in names)
+    """Whether nothing is left to do: every record is there and can be read."""
+    needed = {f"{judgement.name}.json": records.REPORT_KEYS for judgement in task.judgements} | {DONE: records.DONE_KEYS}
+    if task.train is not None:
+        needed[TRAINED] = records.TRAINED_KEYS
+    return all(read_record(task.folder / name, keys) is not None for name, keys in needed.items())
 
 
-def execute(task: Task) -> str:
-    """Do what is left of a task: train, evaluate, say so. Returns the task's name.
+def execute(task: Task) -> bool:
+    """Do what is left of a task: train, evaluate, say so. False if it was left alone, as another call is at work at it.
 
     Raises:
         IncompleteTask: an evaluation failed; the others were made.
+        ChangedRow: another call did it with other settings, since this one looked.
         Exception: training failed, in any way it can.
     """
+    with held(task.folder, GRACE_S) as mine:
+        if mine and not finished(task):
+            check_unchanged(task)
+            _do(task)
+    return mine
+
+
+def _do(task: Task) -> None:
     task.folder.mkdir(parents=True, exist_ok=True)
-    here = {"commit": commit(), "machine": machine()}
-    if task.train is not None and read_record(task.folder / TRAINED) is None:
+    here = {"commit": task.commit, "machine": records.machine()}
+    if task.train is not None and read_record(task.folder / TRAINED, records.TRAINED_KEYS) is None:
         _train(task, task.train, here)
     failed = []
     for judgement in task.judgements:
-        if read_record(task.folder / f"{judgement.name}.json") is None:
+        if read_record(task.folder / f"{judgement.name}.json", records.REPORT_KEYS) is None:
             try:
                 _judge(task, judgement, here)
             except Exception as error:  # whatever it is, the other evaluations go on
@@ -204,7 +181,6 @@ def execute(task: Task) -> str:
     if failed:
         raise IncompleteTask("; ".join(failed))
     write_record(task.folder / DONE, _summary(task, here))
-    return task.name
 
 
 def _train(task: Task, config: TrainConfig, here: Mapping[str, Any]) -> None:
@@ -214,16 +190,21 @@ def _train(task: Task, config: TrainConfig, here: Mapping[str, Any]) -> None:
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     settings = settings_of(config)
-    asked = {"row": task.row, "seed": task.seed, "arguments": list(task.arguments), "config_hash": fingerprint(settings)}
-    if read_record(task.folder / ASKED) is None:
-        write_record(task.folder / ASKED, {**asked, **here, "settings": settings})
     folder = task.folder / RUN_FOLDER
+    before = read_record(task.folder / ASKED, records.ASKED_KEYS)
+    if before is None:
+        # Nobody knows what a run without its record was asked.
+        shutil.rmtree(folder, ignore_errors=True)
+    commits = list(dict.fromkeys([*(records.commits_of(before) if before else []), task.commit]))
+    asked = {"row": task.row, "seed": task.seed, "arguments": list(task.arguments), "config_hash": fingerprint(settings)}
+    asked |= {**here, "commits": commits}
+    write_record(task.folder / ASKED, {**asked, "settings": settings})
     trainer = Trainer(config, folder)
     if (folder / FILE).is_file():
         trainer.restore()
     summary = trainer.run()
     kept = {key: summary[key] for key in ("step", "gradient_step", "episodes", "wall_s", "best_step")}
-    write_record(task.folder / TRAINED, {**asked, **here, **kept})
+    write_record(task.folder / TRAINED, {**asked, **kept})
 
 
 def _judge(task: Task, judgement: Judgement, here: Mapping[str, Any]) -> None:
@@ -236,7 +217,7 @@ def _judge(task: Task, judgement: Judgement, here: Mapping[str, Any]) -> None:
 
 
 def _summary(task: Task, here: Mapping[str, Any]) -> dict[str, Any]:
-    trained = read_record(task.folder / TRAINED)
+    trained = None if task.train is None else read_record(task.folder / TRAINED)
     reports = {judgement.name: read_record(task.folder / f"{judgement.name}.json") or {} for judgement in task.judgements}
     return {
         "row": task.row,

@@ -2,7 +2,8 @@
 
 Scores are arrays (runs, tasks) or (runs, tasks, points); runs are the seeds of a row, tasks what they were judged on. Intervals are the
 2.5th and 97.5th percentile of :data:`REPETITIONS` stratified bootstrap samples over the runs (Agarwal et al., "Deep reinforcement
-learning at the edge of the statistical precipice", 2021), the same ones at every call. One run has no interval.
+learning at the edge of the statistical precipice", 2021), the same ones at every call. One run has no interval, and that of a few runs is
+too narrow: :data:`TRUE_COVERAGE` says by how much. Probabilities of improvement have an interval of another kind, see :func:`improvement`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,13 @@ Floats = NDArray[np.float64]
 REPETITIONS = 2000
 COVERAGE = 0.95
 BOOTSTRAP_SEED = 0
+TRUE_COVERAGE = {2: 0.50, 3: 0.74, 4: 0.88, 5: 0.90, 6: 0.91, 7: 0.91, 8: 0.93, 9: 0.93, 10: 0.94}
+"""How often such an interval of the interquartile mean of so many runs holds the truth, of normal scores; of more runs: 0.94 to 0.95.
+Simulated; a test does it again."""
+
+NORMAL_QUANTILE = 1.959964
+"""Half the width of the middle 95 % of the normal distribution, in standard deviations."""
+
 LEVELS = (0.90, 0.95, 0.99)
 """Success rates whose cost in transfers is told."""
 
@@ -100,22 +108,28 @@ def profile(scores: Floats, thresholds: Floats) -> Band:
     return band_of(scores, lambda drawn: (drawn[..., None] > thresholds).mean((0, 1)))
 
 
+def true_coverage(runs: int) -> float | None:
+    """How often the bootstrap interval of so many runs holds the truth; None of one, which has no interval."""
+    return TRUE_COVERAGE.get(runs, max(TRUE_COVERAGE.values())) if runs > 1 else None
+
+
 def improvement(ours: Floats, theirs: Floats) -> Interval:
-    """Probability that a run of ``ours`` (runs, tasks) beats one of ``theirs`` on the same task; a tie counts half."""
-    library = require_statistics()
+    """Probability that a run of ``ours`` (runs, tasks) beats one of ``theirs`` on the same task; a tie counts half.
 
-    def probability(first: Floats, second: Floats) -> Floats:
-        ahead = first[:, None] - second[None]
-        return np.array([((ahead > 0) + 0.5 * (ahead == 0)).mean()])
-
-    value = float(probability(ours, theirs)[0])
-    if min(len(ours), len(theirs)) == 1:
+    A bootstrap of rows that do not overlap would be sure of what a handful of runs cannot tell. The interval holds every probability P that
+    the estimate lies within 1.96 standard deviations of, these taken at their greatest: whatever the scores' distributions, the variance is
+    at most P (1 - P) / n with n runs of the smaller row, as the estimate is a mean over pairings of the rows, each of n independent pairs.
+    That is Wilson's interval (1927) of n trials; n of n wins leave a lower end of n / (n + 3.84).
+    """
+    ahead = ours[:, None] - theirs[None]
+    value = float(((ahead > 0) + 0.5 * (ahead == 0)).mean())
+    count = min(len(ours), len(theirs))
+    if count == 1:
         return Interval(value, None, None)
-    with _repeatable():
-        _, intervals = library.get_interval_estimates(
-            {"": [ours, theirs]}, probability, reps=REPETITIONS, confidence_interval_size=COVERAGE
-        )
-    return Interval(value, float(intervals[""][0, 0]), float(intervals[""][1, 0]))
+    spread = NORMAL_QUANTILE**2 / count
+    centre = (value + spread / 2) / (1 + spread)
+    half = math.sqrt(spread * value * (1 - value) + spread**2 / 4) / (1 + spread)
+    return Interval(value, max(0.0, centre - half), min(1.0, centre + half))
 
 
 def milestone(costs: Sequence[float | None]) -> Milestone:

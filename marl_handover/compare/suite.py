@@ -6,7 +6,6 @@ below; a file holds no other keys.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -15,25 +14,17 @@ from typing import Any, TypeVar
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from marl_handover.compare.suite_check import RUN, check
 from marl_handover.compose_schema import load_mapping, option_file
 from marl_handover.config import require_at_least, require_choice
 from marl_handover.errors import CorruptFile, HandoverError, UnknownChoice
 from marl_handover.resources import resource_path
 
-RUN = "{run}"
-"""Stands for a trained row's run directory in the name of a policy."""
-
 EVALUATION_SEED_OFFSET = 100
 """Run k of a row is judged on the problems of this seed plus k."""
 
 SIZES = ("full", "quick")
-FIGURES = ("curves", "bars", "end_states", "profiles", "workspace")
-TABLES = ("evaluation", "milestones", "runs", "comparison")
-CURVE_MEASURES = ("success_rate", "mean_steps", "steps_ratio", "training_success_rate", "training_mean_length")
-BAR_MEASURES = ("success_rate", "success_in_the_end", "mean_steps", "steps_ratio", "path_mm", "executor_path_mm")
-CURVE_AXES = ("step", "share")
 
-_NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
 Spec = TypeVar("Spec")
 
 
@@ -192,7 +183,7 @@ def load_suite(name: str) -> Suite:
     head = _fitted(_Head, tree, path, "the file", also=(*lists, "quick"))
     suite = Suite(path.stem, head.title or path.stem, head.seeds, head.train, **parts)
     try:
-        _check(suite)
+        check(suite)
     except HandoverError as error:
         raise CorruptFile("suite", path, str(error)) from error
     return suite
@@ -223,60 +214,3 @@ def _fitted(schema: type[Spec], tree: Any, path: Path, where: str, also: Iterabl
 def _applies(spec: EvaluationSpec, row: RowSpec) -> bool:
     """Whether the row is judged so: it is named, or all are, except that an untrained one has no run to name."""
     return row.name in spec.rows if spec.rows else row.train is not None or RUN not in spec.policy
-
-
-def _check(suite: Suite) -> None:
-    """Raise a :class:`HandoverError` unless names are unique, references exist and every row has one source."""
-    require_at_least("seeds", suite.seeds, 1)
-    require_at_least("quick.seeds", suite.quick.seeds, 1)
-    require_at_least("number of rows", len(suite.rows), 1)
-    for what in ("rows", "evaluations", "figures", "tables"):
-        names: list[str] = []
-        for spec in getattr(suite, what):
-            if not _NAME.fullmatch(spec.name):
-                raise BadEntry(f"{what}: name {spec.name!r}", "small letters, digits and underscores make a name")
-            if spec.name in names:
-                raise BadEntry(f"{what}: {spec.name}", "the name is taken")
-            names.append(spec.name)
-    rows, evaluations = [row.name for row in suite.rows], [spec.name for spec in suite.evaluations]
-    for row in suite.rows:
-        _check_row(row)
-    for spec in suite.evaluations:
-        require_at_least(f"seeds of {spec.name}", spec.seeds, 0)
-        for name in spec.rows:
-            require_choice(f"evaluations: {spec.name}: rows", name, tuple(rows))
-            if RUN in spec.policy and suite.row(name).train is None:
-                raise BadEntry(f"evaluations: {spec.name}", f"row {name} is not trained, so it has no {RUN}")
-    for name in suite.quick.evaluate:
-        require_choice("quick.evaluate", name, tuple(evaluations))
-    for part, kinds in (("figures", FIGURES), ("tables", TABLES)):
-        for entry in getattr(suite, part):
-            require_choice(f"{part}: {entry.name}: kind", entry.kind, kinds)
-            for key, known in (("rows", rows), ("evaluations", evaluations)):
-                for name in getattr(entry, key):
-                    require_choice(f"{part}: {entry.name}: {key}", name, tuple(known))
-    for figure in suite.figures:
-        require_choice(f"figures: {figure.name}: measure", figure.measure, CURVE_MEASURES if figure.kind == "curves" else BAR_MEASURES)
-        require_choice(f"figures: {figure.name}: x", figure.x, CURVE_AXES)
-    for table in suite.tables:
-        for pair in table.pairs:
-            if len(pair) != 2:
-                raise BadEntry(f"tables: {table.name}: pairs: {pair}", "a pair has two rows")
-            for name in pair:
-                require_choice(f"tables: {table.name}: pairs", name, tuple(rows))
-
-
-def _check_row(row: RowSpec) -> None:
-    require_at_least(f"seeds of {row.name}", row.seeds, 0)
-    if (row.train is None) == (not row.policy):
-        raise BadEntry(f"rows: {row.name}", "give `train`, a list that may be empty, or `policy`, one of the two")
-    if RUN in row.policy:
-        raise BadEntry(f"rows: {row.name}: policy", f"{RUN} belongs into an evaluation's policy; a row with a policy is not trained")
-
-
-class BadEntry(HandoverError):
-    """An entry of a suite that makes no sense."""
-
-    def __init__(self, where: str, reason: str) -> None:
-        super().__init__(f"{where}: {reason}")
-        self.where, self.reason = where, reason

@@ -9,6 +9,9 @@ from typing import Any, NamedTuple
 
 Tree = Mapping[str, Any]
 NONE = "–"
+SOLVED = (("mean_steps_success", "steps (solved)", "{:.2f}"), ("steps_ratio", "steps ÷ optimum (solved)", "{:.3f}"))
+"""Measures of solved episodes alone, which a run without any does not have: name, heading, form."""
+PATHS = (("path_mm", "path, mm"), ("executor_path_mm", "executors' on the same way, mm"))
 
 
 class Cell(NamedTuple):
@@ -95,6 +98,18 @@ def _interval(found: Tree | None, form: str, scale: float = 1.0) -> Cell:
     return Cell(form.format(scale * value) + ends, (value, low, high))
 
 
+def _seeds(runs: int, coverage: float | None) -> Cell:
+    """How many runs, and how much their intervals really cover."""
+    return Cell(str(runs) if coverage is None else f"{runs} (≈ {100 * coverage:.0f} %)", (runs, coverage))
+
+
+def _solved(found: Tree | None, runs: int, form: str) -> Cell:
+    """What only solved episodes have, and of how many runs if not of all."""
+    cell = _interval(found, form)
+    known = 0 if found is None else found["runs"]
+    return Cell(cell.text + (f" ({known} of {runs} runs)" if 0 < known < runs else ""), (*cell.values, known))
+
+
 def _interval_column(title: str, name: str) -> Column:
     return Column(title, (name, f"{name}_low", f"{name}_high"))
 
@@ -108,14 +123,14 @@ def _evaluation(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell
     columns = [
         Column("row"),
         Column("evaluation"),
-        Column("seeds"),
+        Column("seeds (intervals cover)", ("seeds", "true_coverage")),
         Column("episodes"),
         _interval_column("success, %", "success_rate"),
         *([_interval_column("in the end, %", "success_in_the_end")] if in_the_end else []),
         Column("mean, %", ("success_rate_mean",)),
         _interval_column("mean steps", "mean_steps"),
-        _interval_column("steps ÷ optimum", "steps_ratio"),
-        *([Column("path, mm", ("path_mm",)), Column("executors' on the same way, mm", ("executor_path_mm",))] if spec["paths"] else []),
+        *(Column(title, (name, f"{name}_low", f"{name}_high", f"{name}_runs")) for name, title, _ in SOLVED),
+        *(_interval_column(title, name) for name, title in PATHS if spec["paths"]),
     ]
     rows = []
     for row, name in shown:
@@ -124,14 +139,14 @@ def _evaluation(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell
             [
                 _text(row["label"]),
                 _text(labels[name]),
-                _text(found["runs"]),
+                _seeds(found["runs"], found["true_coverage"]),
                 _plain(found["episodes"]),
                 _interval(found["success_rate"], "{:.2f}", 100),
                 *([_interval(found.get("success_in_the_end"), "{:.2f}", 100)] if in_the_end else []),
                 _plain(found["success_rate"]["mean"], "{:.2f}", 100),
                 _interval(found["mean_steps"], "{:.2f}"),
-                _interval(found.get("steps_ratio"), "{:.3f}"),
-                *(_plain((found.get(name) or {}).get("mean")) for name in ("path_mm", "executor_path_mm") if spec["paths"]),
+                *(_solved(found.get(measure), found["runs"], form) for measure, _, form in SOLVED),
+                *(_interval(found.get(measure), "{:,.0f}") for measure, _ in PATHS if spec["paths"]),
             ]
         )
     return columns, rows
@@ -160,8 +175,8 @@ def _cost(found: Tree, parts: Sequence[str]) -> Cell:
 
 
 def _runs(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
-    """What was trained: arguments, size, time, commit."""
-    titles = ("row", "arguments", "seeds", "transfers", "gradient steps", "minutes a run", "commit")
+    """What was trained: arguments, size, where each run was at its best, time, commits."""
+    titles = ("row", "arguments", "seeds", "transfers", "gradient steps", "best step", "minutes a run", "commits")
     rows = []
     for row in _wanted(results, spec["rows"]):
         done = [run["trained"] for run in row["runs"] if run["trained"]]
@@ -170,8 +185,9 @@ def _runs(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
         minutes = sum(run["wall_s"] for run in done) / len(done) / 60
         gradient_steps = sum(run["gradient_step"] for run in done) / len(done)
         arguments = " ".join(row["arguments"]) or "(defaults)"
-        commits = ", ".join(dict.fromkeys(run["commit"] for run in done))
-        sizes = (_text(len(done)), _plain(row["settings"]["steps"]), _plain(gradient_steps), _plain(minutes, "{:.1f}"))
+        commits = ", ".join(dict.fromkeys(commit for run in done for commit in run.get("commits", [run["commit"]])))
+        best = ", ".join(NONE if run.get("best_step") is None else f"{run['best_step']:,}" for run in done)
+        sizes = (_text(len(done)), _plain(row["settings"]["steps"]), _plain(gradient_steps), _text(best), _plain(minutes, "{:.1f}"))
         rows.append([_text(row["label"]), Cell(f"`{arguments}`", (arguments,)), *sizes, _text(commits)])
     return [Column(title) for title in titles], rows
 

@@ -13,17 +13,19 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 import optuna
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
+from optuna.samplers import TPESampler
 from optuna.study import Study
 from optuna.trial import Trial, TrialState
 
 from marl_handover.compare.launch import Failure, fan_out
 from marl_handover.compare.records import settings_of, usual_settings
 from marl_handover.compare.tune_space import Parameter, applied, value_of
-from marl_handover.compare.tune_storage import abandoned, claimed, counted, give_back, open_study, running
+from marl_handover.compare.tune_storage import abandoned, claimed, counted, ended, give_back, open_study, place_of, running
 from marl_handover.compare.workers import summary
 from marl_handover.config import MAX_SEED
 from marl_handover.errors import HandoverError, WorkFailed
@@ -119,16 +121,23 @@ def _compare(search: Search, stored: dict[str, Any], about: dict[str, Any]) -> N
 def run_trials(search: Search, study: Study, left: int, **options: Any) -> Generator[Note, None, None]:
     """Do ``left`` trials and tell how each went. ``options`` go to :func:`marl_handover.compare.launch.fan_out`."""
     begun = counted(study)
-    slots = [f"{search.seed}/{begun + index}" for index in range(left)]
-    for slot, result in fan_out(partial(run_trial, search), slots, label=lambda slot: f"trial {slot.partition('/')[2]}", **options):
+    # Another call may count the same trials as left: what tells its slots from this one's is the last part.
+    call = uuid4().hex
+    slots = [f"{search.seed}/{begun + index}/{call}" for index in range(left)]
+    for slot, result in fan_out(partial(run_trial, search), slots, label=lambda slot: f"trial {slot.split('/')[1]}", **options):
         if not isinstance(result, Failure):
             if result is not None:
                 yield result
             continue
-        for trial in running(study):
-            if trial.user_attrs.get("slot") == slot:
-                give_back(study, trial, again=False)
+        _take_back(study, slot, again=False)
         yield Note(-1, "FAIL", None, result.error)
+
+
+def _take_back(study: Study, slot: str, again: bool = True) -> None:
+    """Give back what a dead worker left in a slot; the launcher says that it died, but one that is seen to live is left alone."""
+    for trial in running(study):
+        if trial.user_attrs.get("slot") == slot and abandoned(trial, told=True):
+            give_back(study, trial, again)
 
 
 def run_trial(search: Search, slot: str) -> Note | None:
@@ -136,32 +145,31 @@ def run_trial(search: Search, slot: str) -> Note | None:
 
     Args:
         search: what to do.
-        slot: seed of the study and place in it. One that is run again takes over what a dead worker left.
+        slot: a name that no other item of any call has. One that is run again takes over what a dead worker left.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    seed = _seed(search.seed, int(slot.partition("/")[2]), "proposals")
-    study = open_study(search.storage, search.study, seed, _pruner(search))
-    for left in running(study):
-        if left.user_attrs.get("slot") == slot:
-            give_back(study, left)
+    study = open_study(search.storage, search.study, pruner=_pruner(search))
+    _take_back(study, slot)
     if counted(study) >= search.trials:
         return None
     trial = study.ask()
+    study.sampler = TPESampler(seed=_seed(search.seed, place_of(study, trial.number), "proposals"))
     try:
         with claimed(trial, slot):
             value = _train(search, trial)
     except optuna.TrialPruned:
-        ended = study.tell(trial, state=TrialState.PRUNED)
+        told = ended(study, trial, state=TrialState.PRUNED)
     except Exception as error:  # settings that cannot be trained with are a result of a search like others
-        trial.set_user_attr("error", summary(error))
-        study.tell(trial, state=TrialState.FAIL)
+        ended(study, trial, state=TrialState.FAIL, error=summary(error))
         return Note(trial.number, "FAIL", None, summary(error))
     except BaseException:
         give_back(study, study.trials[trial.number])
         raise
     else:
-        ended = study.tell(trial, value)
-    return Note(trial.number, ended.state.name, ended.value)
+        told = ended(study, trial, value)
+    if told is None:
+        return Note(trial.number, "FAIL", None, "somebody took this trial for dead and ended it; its result counts for nothing")
+    return Note(trial.number, told.state.name, told.value)
 
 
 def _train(search: Search, trial: Trial) -> float:

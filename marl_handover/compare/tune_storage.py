@@ -9,12 +9,11 @@ import threading
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import optuna
-from optuna.samplers import TPESampler
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.study import Study
@@ -30,6 +29,8 @@ SILENT_S = 600.0
 TRIES = 3
 """So often a trial is started whose process dies."""
 SQLITE_WAIT_S = 60.0
+ENDED = (ValueError, RuntimeError)
+"""What Optuna raises when something is told of a trial that was ended before."""
 DRIVERS = {"psycopg": "'psycopg[binary]'", "psycopg2": "psycopg2-binary", "MySQLdb": "mysqlclient"}
 """Packages that are not called as their modules are."""
 
@@ -80,14 +81,13 @@ def open_storage(storage: str) -> BaseStorage:
         raise StorageUnavailable(storage, f"cannot be opened: {(str(error).splitlines() or [type(error).__name__])[0]}") from None
 
 
-def open_study(storage: str, name: str, seed: int | None = None, pruner: optuna.pruners.BasePruner | None = None) -> Study:
-    """The study of that name, made if it is not there; the higher the value, the better. ``seed``: of what it proposes."""
+def open_study(storage: str, name: str, pruner: optuna.pruners.BasePruner | None = None) -> Study:
+    """The study of that name, made if it is not there; the higher the value, the better."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         return optuna.create_study(
             study_name=name,
             storage=open_storage(storage),
-            sampler=TPESampler(seed=seed),
             pruner=pruner or optuna.pruners.NopPruner(),
             direction="maximize",
             load_if_exists=True,
@@ -109,8 +109,10 @@ def claimed(trial: Trial, slot: str) -> Iterator[None]:
     over = threading.Event()
 
     def beat() -> None:
-        while not over.wait(BEAT_S):
-            trial.set_user_attr("beat", time.time())
+        # A trial that somebody ended takes no more attributes; its process finds out when it tells the result.
+        with suppress(*ENDED):
+            while not over.wait(BEAT_S):
+                trial.set_user_attr("beat", time.time())
 
     trial.set_user_attr("beat", time.time())
     thread = threading.Thread(target=beat, daemon=True)
@@ -122,25 +124,45 @@ def claimed(trial: Trial, slot: str) -> Iterator[None]:
         thread.join()
 
 
-def abandoned(trial: FrozenTrial) -> bool:
-    """Whether a running trial's process is gone. On another machine than this, silence tells."""
+def abandoned(trial: FrozenTrial, told: bool = False) -> bool:
+    """Whether a running trial's process is gone.
+
+    On this machine the process itself is looked for. Of another machine's, silence tells, or ``told``: who started it says that it died.
+    """
     worker, beat = trial.user_attrs.get("worker"), trial.user_attrs.get("beat", 0.0)
     if worker is not None and worker["host"] == socket.gethostname():
         return bool(_started(worker["pid"]) != worker["started"])
     begun = trial.datetime_start.timestamp() if trial.datetime_start is not None else 0.0
-    return time.time() - max(beat, begun) > SILENT_S
+    return told or time.time() - max(beat, begun) > SILENT_S
 
 
 def give_back(study: Study, trial: FrozenTrial, again: bool = True) -> None:
     """Fail a trial whose process died, and queue its settings once more, unless they were tried too often."""
     try:
         study.tell(trial.number, state=TrialState.FAIL)
-    except (ValueError, RuntimeError):
+    except ENDED:
         return  # somebody else was faster
     tries = int(trial.user_attrs.get("tries", 1))
     if again and tries < TRIES:
         about = {"again_of": trial.number, "origin": trial.user_attrs.get("origin", trial.number), "tries": tries + 1}
         study.enqueue_trial(trial.params, user_attrs=about)
+
+
+def ended(study: Study, trial: Trial, value: float | None = None, state: TrialState | None = None, error: str = "") -> FrozenTrial | None:
+    """Tell how a trial went; None if it counts for nothing, as somebody ended it before."""
+    try:
+        if error:
+            trial.set_user_attr("error", error)
+        return study.tell(trial, value, state=state)
+    except ENDED:
+        return None
+
+
+def place_of(study: Study, number: int) -> int:
+    """How many trials come before one, those that were given back left out: no two calls at one study get the same."""
+    trials = study.get_trials(deepcopy=False)
+    replaced = {trial.user_attrs.get("again_of") for trial in trials}
+    return sum(trial.number < number and trial.number not in replaced for trial in trials)
 
 
 def running(study: Study) -> list[FrozenTrial]:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from marl_handover.cli import main
+from marl_handover.compare import runs
+from marl_handover.compare.locks import held
 
 SUITE = """
 title: Small
@@ -31,7 +35,7 @@ figures:
   - {name: profiles, kind: profiles, evaluations: [kinematic]}
   - {name: workspace, kind: workspace}
 tables:
-  - {name: success, kind: evaluation}
+  - {name: success, kind: evaluation, paths: true}
   - {name: costs, kind: milestones}
   - {name: pairs, kind: comparison, pairs: [[exact, b], [b, random]]}
   - {name: runs, kind: runs}
@@ -45,8 +49,12 @@ def compared(folder: Path, *arguments: str) -> int:
     return main(["compare", f"suite={folder / 'small.yaml'}", f"out={folder / 'out'}", "jobs=1", "progress=false", *arguments])
 
 
+def results_at(out: Path):
+    return json.loads((out / "results.json").read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+
+
 def results(folder: Path):
-    return json.loads((folder / "out/results.json").read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    return results_at(folder / "out")
 
 
 @pytest.fixture(scope="module")
@@ -100,9 +108,9 @@ def test_tables_say_what_the_results_say(home):
         assert float(line["success_rate"]) == told["success_rate"]["value"]
         assert line["mean_steps_high"] == ("" if told["mean_steps"]["high"] is None else str(told["mean_steps"]["high"]))
     text = (home / "out/tables/success.md").read_text()
-    assert "| exact planner | kinematic | 2 | 80 | 100.00 [100.00, 100.00] | 100.00 |" in text
+    assert "| exact planner | kinematic | 2 (≈ 50 %) | 80 | 100.00 [100.00, 100.00] | 100.00 |" in text
     assert "0 of 2" in (home / "out/tables/costs.md").read_text()
-    assert "exact planner – learned | 1.00 [1.00, 1.00]" in (home / "out/tables/pairs.md").read_text()
+    assert "exact planner – learned | 1.00 [0.34, 1.00]" in (home / "out/tables/pairs.md").read_text()
 
 
 def test_a_second_call_runs_nothing(home, capsys):
@@ -119,9 +127,9 @@ def test_an_interrupted_suite_does_what_is_left(home):
     for name in ("done.json", "kinematic.json"):
         (lost / name).unlink()
     assert compared(home, "report_only=true") == 0
-    assert results(home)["missing"] == ["exact/seed1"]
+    assert (results(home)["missing"], results(home)["partial"]) == (["exact/seed1"], True)
     assert compared(home) == 0
-    assert results(home)["missing"] == []
+    assert (results(home)["missing"], results(home)["partial"]) == ([], False)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
 
 
@@ -169,7 +177,9 @@ def test_the_smoke_size_has_a_folder_and_fewer_seeds_of_its_own(tmp_path, monkey
         ("preset=small", "full, quick"),
         ("rows=[c]", "b, exact, random"),
         ("fresh=[c]", "exact, exact/kinematic, exact/noise"),
+        ("fresh=[exact/shielded]", "exact/noise"),
         ("seeds=-1", "seeds"),
+        ("address=auto", "launcher=loky"),
         ("launcher=slurm", "loky, ray"),
         ("suite=papper", "paper"),
         ("suite=./none.yaml", "none.yaml"),
@@ -183,6 +193,79 @@ def test_bad_input_is_one_line_and_exit_2(tmp_path, capsys, argument, word):
     assert (out, err.count("\n")) == ("", 1), err
     assert "Traceback" not in err
     assert word in err
+
+
+def test_fresh_knows_which_evaluations_a_row_has(tmp_path, capsys):
+    (tmp_path / "small.yaml").write_text(SUITE)
+    assert compared(tmp_path, "fresh=[random/noise]") == 2
+    assert "random/kinematic" in capsys.readouterr().err
+    assert compared(tmp_path, "fresh=[random]", "report_only=true") == 2
+    assert "makes nothing anew" in capsys.readouterr().err
+
+
+def test_a_part_of_a_suite_says_so_and_leaves_no_pictures_of_another_time(tmp_path, capsys):
+    (tmp_path / "small.yaml").write_text(SUITE)
+    for folder in ("tables", "figures"):
+        (tmp_path / "out" / folder).mkdir(parents=True)
+    for old in ("figures/learning.png", "figures/learning.pdf", "tables/costs.md", "figures/mine.txt"):
+        (tmp_path / "out" / old).write_text("of another time")
+    assert compared(tmp_path, "rows=[exact]", "seeds=1") == 0
+    assert "partial" in capsys.readouterr().out
+    found = results(tmp_path)
+    assert found["partial"]
+    assert [(part["row"], part["done"], part["of"], part["seeds"]) for part in found["progress"]] == [
+        ("b", 0, 2, []),
+        ("exact", 1, 2, [0]),
+        ("random", 0, 2, []),
+    ]
+    assert found["missing"] == []
+    assert set(found["empty_figures"]) == {"learning", "length"}
+    assert {path.name for path in (tmp_path / "out/figures").iterdir()} == {
+        "mine.txt",
+        *(f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf") if name not in ("learning", "length")),
+    }
+    assert {path.stem for path in (tmp_path / "out/tables").iterdir()} == {"success"}
+
+
+def test_a_run_that_cannot_be_read_is_told_and_the_others_are_reported(home, capsys):
+    metrics = home / "out/b/seed0/run/metrics.csv"
+    kept = metrics.read_bytes()
+    metrics.write_bytes(kept + kept)
+    assert compared(home) == 1
+    err = capsys.readouterr().err
+    for word in ("1 of 6 runs failed", "b/seed0: cannot be read", "metrics.csv", "fresh=[b]"):
+        assert word in err
+    found = results(home)
+    assert (list(found["failures"]), found["missing"]) == (["b/seed0"], ["b/seed0"])
+    assert found["rows"][0]["seeds"] == [1]
+    metrics.write_bytes(kept)
+    assert compared(home) == 0
+
+
+@pytest.mark.slow
+def test_two_calls_at_one_folder_do_each_run_once(tmp_path):
+    (tmp_path / "small.yaml").write_text(SUITE)
+    call = [sys.executable, "-m", "marl_handover.cli", "compare", f"suite={tmp_path / 'small.yaml'}", f"out={tmp_path / 'out'}"]
+    calls = [
+        subprocess.Popen([*call, "jobs=1", "progress=false", "rows=[b]", "seeds=1"], stderr=subprocess.PIPE, text=True) for _ in range(2)
+    ]
+    told = [(process.communicate(timeout=120)[1], process.returncode) for process in calls]
+    assert 0 in [code for _, code in told]
+    assert all(code == 0 or "another call is at work at b/seed0" in err for err, code in told)
+    assert len((tmp_path / "out/b/seed0/run/metrics.csv").read_text().splitlines()) == 4
+    assert compared(tmp_path, "rows=[b]", "seeds=1") == 0
+
+
+def test_out_may_be_relative_and_what_is_not_done_is_no_success(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runs, "GRACE_S", 0.0)
+    (tmp_path / "small.yaml").write_text(SUITE)
+    with held(tmp_path / "mine/exact/seed0") as mine:
+        assert mine
+        assert main(["compare", "suite=./small.yaml", "out=mine", "jobs=1", "progress=false", "rows=[exact]"]) == 1
+    assert "another call is at work at exact/seed0" in capsys.readouterr().err
+    assert results_at(tmp_path / "mine")["missing"] == ["exact/seed0"]
+    assert main(["compare", "suite=./small.yaml", "out=mine", "jobs=1", "progress=false", "rows=[exact]"]) == 0
 
 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path, capsys):

@@ -148,6 +148,7 @@ def test_a_search_without_a_result_says_why(tmp_path, capsys):
         ("jobs=-1", ("jobs",)),
         ("pruner=hope", ("median, hyperband, none",)),
         ("launcher=slurm", ("loky, ray",)),
+        ("address=auto", ("address", "launcher=loky")),
         ("search=nowhere", ("nowhere", "sac", "dqn")),
         ("search=./nowhere.yaml", ("nowhere.yaml",)),
         ("fixed=[algorithm.gama]", ("algorithm.gama", "algorithm.gamma")),

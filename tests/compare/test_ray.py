@@ -19,7 +19,7 @@ import pytest
 
 from marl_handover.cli import main
 from marl_handover.compare.launch import Failure, fan_out
-from marl_handover.compare.ray_workers import ClusterUnavailable
+from marl_handover.compare.ray_workers import ClusterUnavailable, _root_cause
 
 cluster_utils = pytest.importorskip("ray.cluster_utils", reason="ray is not installed (pip install 'marl_handover[ray]')")
 
@@ -149,6 +149,19 @@ def test_a_cluster_that_is_not_there_is_one_line():
         with pytest.raises(ClusterUnavailable, match="ray start --head") as error:
             list(fan_out(fails, [0], launcher="ray", address=where, progress=False))
         assert "\n" not in str(error.value)
+
+
+def test_what_ray_wraps_in_advice_is_told_by_its_cause():
+    def connect():
+        try:
+            raise RuntimeError("Version mismatch: the cluster was started with Ray: 2.9\n  This process: Ray: 2.60")
+        except RuntimeError as error:
+            raise ConnectionError("ray client connection failed. Start Ray with: ray start --head") from error
+
+    with pytest.raises(ConnectionError) as caught:
+        connect()
+    assert _root_cause(caught.value) == "RuntimeError: Version mismatch: the cluster was started with Ray: 2.9"
+    assert "ray start" not in str(ClusterUnavailable("auto", _root_cause(caught.value), absent=False))
 
 
 SUITE = """

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import threading
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from marl_handover.commands import evaluate, train
-from marl_handover.compare.records import fingerprint, read_record, settings_of, usual_settings
-from marl_handover.compare.runs import ChangedRow, Grammar, IncompleteTask, Task, check_unchanged, clear, execute, finished, plan_tasks
+from marl_handover.compare import runs
+from marl_handover.compare.plan import Grammar, plan_tasks
+from marl_handover.compare.records import commits_of, fingerprint, read_record, settings_of, usual_settings
+from marl_handover.compare.runs import Busy, ChangedRow, IncompleteTask, Task, check_unchanged, clear, clear_all, execute, finished
 from marl_handover.compare.suite import load_suite
+from marl_handover.learning import trainer
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.trainer import Trainer
 
@@ -44,7 +51,7 @@ def home(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("suite")
     for task in planned(folder).values():
         assert not finished(task)
-        assert execute(task) == task.name
+        assert execute(task)
     return folder
 
 
@@ -88,7 +95,7 @@ def test_what_is_done_is_not_done_again(home):
     }
 
 
-def test_a_run_that_was_interrupted_goes_on_from_its_checkpoint(home, tmp_path):
+def test_a_run_that_was_interrupted_goes_on_from_its_checkpoint_and_lists_both_commits(home, tmp_path, monkeypatch):
     class Stopped(Exception):
         pass
 
@@ -96,13 +103,17 @@ def test_a_run_that_was_interrupted_goes_on_from_its_checkpoint(home, tmp_path):
         if row["step"] >= 384:
             raise Stopped
 
-    task = planned(tmp_path)["b"]
-    with pytest.raises(Stopped):
-        Trainer(task.train, Path(task.train.out), on_evaluation=stop).run()
+    task = replace(planned(tmp_path)["b"], commit="aaaaaaa")
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer, "Trainer", partial(Trainer, on_evaluation=stop))
+        with pytest.raises(Stopped):
+            execute(task)
     assert not finished(task)
     begun = (task.folder / "run/metrics.csv").read_text().splitlines()
-    execute(task)
+    execute(replace(task, commit="bbbbbbb"))
     assert finished(task)
+    assert read_record(task.folder / "trained.json")["commits"] == ["aaaaaaa", "bbbbbbb"]
+    assert read_record(task.folder / "kinematic.json")["provenance"]["commit"] == "bbbbbbb"
     whole = (task.folder / "run/metrics.csv").read_text().splitlines()
     assert whole[:3] == begun[:3]  # to the checkpoint at 256, the clock's readings included
     once = (home / "out/b/seed0/run/metrics.csv").read_text().splitlines()
@@ -111,6 +122,80 @@ def test_a_run_that_was_interrupted_goes_on_from_its_checkpoint(home, tmp_path):
         return [[value for index, value in enumerate(line.split(",")) if index != once[0].split(",").index("wall_s")] for line in lines]
 
     assert timeless(whole) == timeless(once)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("trained.json", "{"), ("done.json", "{}"), ("kinematic.json", '{"episodes": 20}'), ("kinematic.json", None), ("trained.json", "[]")],
+)
+def test_a_damaged_record_is_made_again_and_is_the_same(home, name, text):
+    task = planned(home)["b"]
+    path = task.folder / name
+    before = read_record(path)
+    kept = path.read_bytes()
+    report = {**before, "provenance": {**before.get("provenance", {}), "settings": 3}}
+    path.write_text(json.dumps(report) if text is None else text)
+    assert not finished(task)
+    check_unchanged(task)
+    assert execute(task)
+    assert finished(task)
+    after = read_record(path)
+    for key in ("step", "best_step", "success_rate", "outcomes", "evaluations", "config_hash"):
+        assert after.get(key) == before.get(key)
+    path.write_bytes(kept)
+
+
+def test_a_run_of_which_nobody_knows_what_it_was_asked_is_begun_anew(tmp_path):
+    task = planned(tmp_path)["b"]
+    Trainer(replace(task.train, steps=256), Path(task.train.out)).run()
+    assert execute(task)
+    assert (read_record(task.folder / "trained.json")["step"], read_record(task.folder / "trained.json")["commits"]) == (512, [task.commit])
+
+
+def test_records_of_before_commits_were_kept_are_whole(home):
+    task = planned(home)["b"]
+    for name in ("task.json", "trained.json"):
+        stored = read_record(task.folder / name)
+        del stored["commits"]
+        (task.folder / name).write_text(json.dumps(stored))
+    assert finished(task)
+    check_unchanged(task)
+    assert commits_of(read_record(task.folder / "trained.json")) == [task.commit]
+
+
+def test_a_task_that_another_process_is_at_is_left_alone_until_that_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "GRACE_S", 0.0)
+    tasks = planned(tmp_path, SUITE.replace("{name: b, train: []}", "{name: greedy, policy: greedy}"))
+    task = tasks["greedy"]
+    code = (
+        "import sys; from pathlib import Path; from marl_handover.compare.locks import held\n"
+        "with held(Path(sys.argv[1])) as mine: print(mine, flush=True); sys.stdin.read()"
+    )
+    other = subprocess.Popen([sys.executable, "-c", code, str(task.folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert other.stdout.readline() == "True\n"
+        assert execute(task) is False
+        assert not task.folder.exists()
+        execute(tasks["exact"])
+        with pytest.raises(Busy, match="greedy/seed0"):
+            clear_all(list(tasks.values()), ["exact", "greedy"])
+        assert finished(tasks["exact"])
+        monkeypatch.setattr(runs, "GRACE_S", 60.0)
+        threading.Timer(0.5, other.kill).start()
+        assert execute(task) is True, "a dying worker's lock is waited for"
+    finally:
+        other.kill()
+        other.wait()
+    clear_all(list(tasks.values()), ["exact"])
+    assert (finished(task), finished(tasks["exact"])) == (True, False)
+
+
+def test_what_another_call_did_with_other_settings_meanwhile_is_not_taken_for_ours(home):
+    task = planned(home)["b"]
+    (task.folder / "done.json").rename(task.folder / "kept")
+    with pytest.raises(ChangedRow, match="steps = 512"):
+        execute(replace(task, train=replace(task.train, steps=640)))
+    (task.folder / "kept").rename(task.folder / "done.json")
 
 
 @pytest.mark.parametrize(

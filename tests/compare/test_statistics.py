@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rliable import library, metrics
 
 from marl_handover.compare import statistics
-from marl_handover.compare.statistics import band_of, first_reaching, improvement, mean, milestone, profile
+from marl_handover.compare.statistics import band_of, first_reaching, improvement, mean, milestone, profile, true_coverage
 from marl_handover.errors import HandoverError
 
 SCORES = np.array([[0.2], [0.9], [0.6], [0.7], [0.65]])
@@ -100,6 +100,39 @@ def test_improvement_is_the_share_of_pairs(seed):
     assert found.value == pytest.approx(sum(pairs) / len(pairs))
     assert found.low <= found.value <= found.high
     assert found.value + improvement(theirs, ours).value == pytest.approx(1.0)
+
+
+def test_no_number_of_wins_is_certainty():
+    for runs in (2, 3, 5, 50):
+        ours, theirs = 1 + np.arange(runs)[:, None], np.zeros((runs, 1))
+        found = improvement(ours, theirs)
+        assert (found.value, found.high) == (1.0, pytest.approx(1.0))
+        assert found.low == pytest.approx(runs / (runs + 1.959964**2))
+        assert improvement(theirs, ours) == pytest.approx((0.0, 0.0, 1 - found.low))
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.8, 2.5])
+@pytest.mark.parametrize("runs", [(3, 3), (5, 3), (5, 5)])
+def test_the_interval_of_an_improvement_holds_the_truth_as_often_as_it_says(shift, runs):
+    random = np.random.default_rng(3)
+    truth = 0.5 * (1 + math.erf(shift / 2))  # of two normal scores, one shifted
+    drawn = [(random.standard_normal((runs[0], 1)) + shift, random.standard_normal((runs[1], 1))) for _ in range(1500)]
+    found = [improvement(ours, theirs) for ours, theirs in drawn]
+    assert np.mean([interval.low <= truth <= interval.high for interval in found]) > 0.94
+
+
+@pytest.mark.parametrize("runs", [2, 3, 5, 10])
+def test_the_true_coverage_of_intervals_of_few_runs(runs):
+    """Repeats the simulation, in its own vectorised bootstrap."""
+    random = np.random.default_rng(4)
+    held = []
+    for scores in random.standard_normal((2000, runs)):
+        drawn = scores[random.integers(0, runs, (400, runs))]
+        ordered, cut = np.sort(drawn, -1), runs // 4
+        low, high = np.percentile(ordered[:, cut : runs - cut].mean(-1), [2.5, 97.5])
+        held.append(low <= 0 <= high)
+    assert np.mean(held) == pytest.approx(true_coverage(runs), abs=0.03)
+    assert true_coverage(1) is None
 
 
 def test_improvement_without_ties_is_rliables():

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from marl_handover.commands import evaluate, train
-from marl_handover.compare.runs import BadRow, Grammar, plan_tasks
+from marl_handover.compare.plan import BadRow, Grammar, plan_tasks
 from marl_handover.compare.suite import Suite, load_suite, suite_folder
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, UnknownChoice
 
@@ -82,11 +82,12 @@ def test_tasks_are_rows_by_seeds_with_arguments_from_weak_to_strong(suite):
     first = tasks[0]
     assert first.train is not None
     assert (first.train.steps, first.train.task.architecture, first.train.seed) == (1000, "A", 0)
-    assert first.train.out == str(Path("out/a/seed0/run"))
+    home = Path("out").absolute()  # workers may stand elsewhere
+    assert first.train.out == str(home / "a/seed0/run")
     assert [(j.name, j.config.policy, j.config.seed, j.config.episodes) for j in first.judgements] == [
-        ("kinematic", "out/a/seed0/run", 100, 10),
-        ("shielded", "shielded:out/a/seed0/run", 100, 1000),
-        ("chosen", "out/a/seed0/run", 100, 1000),
+        ("kinematic", f"{home}/a/seed0/run", 100, 10),
+        ("shielded", f"shielded:{home}/a/seed0/run", 100, 1000),
+        ("chosen", f"{home}/a/seed0/run", 100, 1000),
     ]
     assert [j.name for j in tasks[1].judgements] == ["kinematic", "chosen"]
     untrained = tasks[-1]
@@ -139,6 +140,16 @@ def test_seeds_and_rows_from_the_command_line(suite):
         ("quick:", "figures: [{name: f, kind: curves, measure: loss}]\nquick:", "figures: f: measure"),
         ("quick:", "figures: [{name: f, kind: curves, x: days}]\nquick:", "figures: f: x"),
         ("quick:", "figures: 3\nquick:", "figures: expected a list"),
+        ("{name: b, train: []}", "{name: b, train: [seed=3]}", "rows: b: train: seed=3 would be ignored"),
+        ("train: [steps=1000]", "train: [out=here]", "train: out=here would be ignored"),
+        ("train: [steps=50]", "train: [resume=runs/a]", "quick.train: resume=runs/a would be ignored"),
+        ("arguments: [episodes=10]", "arguments: [policy=exact]", "evaluations: kinematic: arguments: policy=exact would be ignored"),
+        ("evaluate: [architecture=A]", "evaluate: [seed=4]", "rows: exact: evaluate: seed=4 would be ignored"),
+        ("quick:", "figures: [{name: f, kind: end_states, measure: mean_steps}]\nquick:", "figures: f: measure: the kind end_states"),
+        ("quick:", "figures: [{name: f, kind: bars, x: share}]\nquick:", "figures: f: x: the kind bars"),
+        ("quick:", "figures: [{name: f, kind: curves, evaluations: [kinematic]}]\nquick:", "figures: f: evaluations: the kind curves"),
+        ("quick:", "tables: [{name: t, kind: runs, pairs: [[a, b]]}]\nquick:", "tables: t: pairs: the kind runs"),
+        ("quick:", "tables: [{name: t, kind: comparison}]\nquick:", "a comparison needs some"),
         ("quick:", "tables: [{name: t, kind: comparison, pairs: [[a]]}]\nquick:", "a pair has two rows"),
         ("quick:", "tables: [{name: t, kind: comparison, pairs: [[a, z]]}]\nquick:", "tables: t: pairs"),
     ],
@@ -169,3 +180,16 @@ def test_bad_evaluation_settings_too(tmp_path):
     suite = load_suite(written(tmp_path, MINIMAL.replace("epsilon_deg=2", "json=x")))
     with pytest.raises(BadRow, match="row a: unknown key 'json"):
         plan_tasks(suite, Path("out"), TRAIN, EVALUATE)
+
+
+def test_policies_that_are_paths_are_found_from_everywhere(tmp_path):
+    rows = "{name: mine, policy: 'shielded:runs/x'}\n  - {name: b, policy: greedy}"
+    suite = load_suite(written(tmp_path, MINIMAL.replace("{name: b, train: []}", rows)))
+    policies = {task.row: task.judgements[0].config.policy for task in plan_tasks(suite, Path("out"), TRAIN, EVALUATE)}
+    assert policies["mine"] == f"shielded:{Path('runs/x').absolute()}"
+    assert (policies["b"], policies["exact"]) == ("greedy", "exact")
+
+
+def test_what_the_papers_suite_compares_knows_nothing_of_the_shield():
+    for table in load_suite("paper").tables:
+        assert table.kind != "comparison" or (table.evaluations and "shielded" not in table.evaluations)

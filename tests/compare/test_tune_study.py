@@ -16,12 +16,14 @@ from hypothesis import strategies as st
 from optuna.trial import TrialState, create_trial
 
 from marl_handover.commands.train import resumed
-from marl_handover.compare.tune import ChangedStudy, Search, prepare, run_trial, run_trials, score
+from marl_handover.compare import tune
+from marl_handover.compare.tune import ChangedStudy, Search, prepare, run_trial, run_trials
 from marl_handover.compare.tune_space import applied, load_space, value_of
-from marl_handover.compare.tune_storage import TRIES, claimed, counted, give_back, hidden, located, open_study, running
+from marl_handover.compare.tune_storage import TRIES, abandoned, claimed, counted, give_back, hidden, located, open_study, place_of, running
 from marl_handover.errors import CorruptFile, UnknownKey
 from marl_handover.learning.algorithm_settings import ALGORITHMS, OffPolicyConfig
 from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.trainer import validation_score
 from marl_handover.resources import resource_path
 
 SPACES = resource_path("configs") / "search"
@@ -179,14 +181,14 @@ def test_a_trial_is_judged_by_the_best_of_its_validations(search):
     with (search.folder / "0000" / "metrics.csv").open(newline="") as stream:
         rows = [{key: float(row[key] or "nan") for key in ("step", "success_rate", "steps_ratio")} for row in csv.DictReader(stream)]
     assert [row["step"] for row in rows] == [64, 128, 192, 256]
-    assert list(trial.intermediate_values.values()) == pytest.approx([score(row) for row in rows], rel=1e-4)
-    assert trial.value == pytest.approx(max(map(score, rows)), rel=1e-4)
+    assert list(trial.intermediate_values.values()) == pytest.approx([validation_score(row) for row in rows], rel=1e-4)
+    assert trial.value == pytest.approx(max(map(validation_score, rows)), rel=1e-4)
     assert trial.user_attrs["success_rate"] in [row["success_rate"] for row in rows]
 
 
 def test_the_score_weighs_success_and_transfers():
-    assert score({"success_rate": 0.9, "steps_ratio": 1.2}) == pytest.approx(0.9 - 0.05 * 0.2)
-    assert score({"success_rate": 0.0, "steps_ratio": float("nan")}) == 0
+    assert validation_score({"success_rate": 0.9, "steps_ratio": 1.2}) == pytest.approx(0.9 - 0.05 * 0.2)
+    assert validation_score({"success_rate": 0.0, "steps_ratio": float("nan")}) == 0
 
 
 def test_a_hopeless_trial_is_ended_and_its_run_stays_whole(search):
@@ -264,6 +266,59 @@ def test_a_slot_takes_over_what_its_dead_worker_left(search):
     note = run_trial(search, "5/0")
     assert (note.number, note.state) == (1, "COMPLETE")
     assert study.trials[1].user_attrs["again_of"] == 0
+
+
+def test_another_calls_live_trial_of_the_same_place_is_left_alone(search):
+    study, _ = prepare(search)
+    other = study.ask()
+    with claimed(other, "5/0/theirs"):
+        note = run_trial(search, "5/0/ours")
+        again = run_trial(search, "5/0/theirs")
+        assert [trial.number for trial in running(study)] == [other.number]
+    assert [(told.number, told.state) for told in (note, again)] == [(1, "COMPLETE"), (2, "COMPLETE")]
+    assert len({str(trial.params) for trial in study.trials}) == 3
+
+
+def test_the_launchers_word_counts_for_another_machine_and_not_for_a_live_process_here(search):
+    study, _ = prepare(search)
+    trial = study.ask()
+    with claimed(trial, "slot"):
+        (seen,) = running(study)
+        assert not abandoned(seen, told=True)
+        elsewhere = {**seen.user_attrs["worker"], "host": "elsewhere"}
+        trial.set_user_attr("worker", elsewhere)
+        (seen,) = running(study)
+        assert (abandoned(seen), abandoned(seen, told=True)) == (False, True)
+
+
+def test_a_trial_that_somebody_ended_meanwhile_ends_without_harm(search, monkeypatch):
+    study, _ = prepare(search)
+
+    def interrupted(search, trial):
+        give_back(study, study.trials[trial.number])
+        return 0.9
+
+    monkeypatch.setattr(tune, "_train", interrupted)
+    note = run_trial(search, "5/0/ours")
+    assert (note.state, note.value) == ("FAIL", None)
+    assert "counts for nothing" in note.error
+    assert [trial.state for trial in study.trials[1:]] == [TrialState.WAITING]
+
+
+def test_every_call_has_slots_of_its_own(search):
+    study, _ = carried_out(replace(search, trials=1))
+    carried_out(replace(search, trials=2))
+    slots = [trial.user_attrs["slot"] for trial in study.trials]
+    assert [slot.rpartition("/")[0] for slot in slots] == ["5/0", "5/1"]
+    assert len({slot.rpartition("/")[2] for slot in slots}) == 2
+
+
+def test_places_are_counted_without_those_given_back(search):
+    study, _ = prepare(search)
+    for _ in range(2):
+        study.ask()
+    give_back(study, study.trials[0])
+    assert [place_of(study, number) for number in (1, 2, 3)] == [0, 1, 2]
 
 
 def test_a_trial_that_kills_its_process_is_given_up(search):

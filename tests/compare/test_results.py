@@ -1,0 +1,53 @@
+"""Comparing costs of trainings of unequal length, and rows some of whose runs solved nothing."""
+
+from __future__ import annotations
+
+import pytest
+
+from marl_handover.compare.results import _sooner
+from marl_handover.compare.tables import csv_text, make_tables, markdown
+
+
+def row(budget: int, *reached: int | None):
+    """A row whose runs were at 95 % at these transfers."""
+    runs = []
+    for at in reached:
+        rates = [1.0 if at is not None and step >= at else 0.0 for step in range(0, budget + 100, 100)]
+        runs.append({"metrics": {"step": list(range(0, budget + 100, 100)), "success_rate": rates}})
+    return {"settings": {"steps": budget}, "runs": runs}
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "probability"),
+    [
+        (row(1000, 300, 400), row(1000, 500, None), 1.0),
+        # The longer one got there after the shorter one's end: nobody knows when the shorter one would have.
+        (row(400, None, None), row(1000, 700, 900), 0.5),
+        (row(400, 300, 300), row(1000, 700, 900), 1.0),
+        (row(1000, 700, 900), row(400, 300, None), 0.25),
+        (row(1000, 400, 400), row(400, 400, 400), 0.5),
+        (row(950, 1000, 1000), row(950, None, None), 1.0),
+    ],
+)
+def test_a_run_is_not_called_slower_than_another_that_was_given_longer(first, second, probability):
+    assert _sooner(first, second)["value"] == probability
+    assert _sooner(second, first)["value"] == 1 - probability
+    assert _sooner(first, second)["until_step"] == min(first["settings"]["steps"], second["settings"]["steps"])
+
+
+def test_how_many_runs_have_solved_anything_is_told():
+    interval = {"value": 0.5, "low": 0.4, "high": 0.6, "mean": 0.5}
+    found = {"runs": 5, "true_coverage": 0.9, "episodes": 50, "success_rate": interval, "mean_steps": interval, "path_mm": interval}
+    found |= {"steps_ratio": {**interval, "runs": 2}, "mean_steps_success": {**interval, "runs": 5}}
+    spec = {"name": "t", "kind": "evaluation", "title": "", "rows": [], "evaluations": [], "paths": True}
+    results = {
+        "tables": [spec],
+        "evaluations": [{"name": "k", "label": ""}],
+        "rows": [{"name": "a", "label": "a", "evaluations": {"k": found}}],
+    }
+    (table,) = make_tables(results)
+    text = markdown(table)
+    assert "| steps (solved) | steps ÷ optimum (solved) | path, mm |" in text
+    assert "| 0.50 [0.40, 0.60] | 0.500 [0.400, 0.600] (2 of 5 runs) | 0 [0, 1] | – |" in text
+    assert "| 5 (≈ 90 %) |" in text
+    assert "steps_ratio_runs,path_mm,path_mm_low,path_mm_high" in csv_text(table)
