@@ -15,14 +15,19 @@ from marl_handover.cell import NO_ARM
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import CellConfig, MotionConfig, NoiseConfig, changed, require_seed
 from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, WorkFailed
+from marl_handover.learning.rollout import nobody_moves
 from marl_handover.policies import SupervisorPolicy, adapted
 from marl_handover.task.planner import ExactPlanner
-from marl_handover.task.rules import Outcome, Rules
+from marl_handover.task.rules import Outcome, Rules, Transition
 
 if TYPE_CHECKING:
     from marl_handover.motion.planner import MotionPlanner
 
 Floats = NDArray[np.float64]
+
+OUT_OF_REACH, MOTION = "out_of_reach", "motion"
+REASONS = {OUT_OF_REACH: "out of this arm's reach", MOTION: "the policy's motion breaks a limit or collides"}
+"""Why transfers are refused here, and how that is said."""
 
 
 @dataclass
@@ -68,7 +73,7 @@ def run(config: PlanConfig) -> int:
             reached = bool(rules.cell.reaches(pose).any())
         if not reached:
             raise OutOfReach(name, (float(pose[0]), float(pose[1])), rules.cell.r_min_mm, rules.cell.r_max_mm)
-    planner = _planner(config, rules)
+    planner = _planner(config, policy)
     plan = solve(policy, poses["start"], poses["goal"])
     print(_text(plan, rules))
     if planner is not None:
@@ -80,7 +85,9 @@ def run(config: PlanConfig) -> int:
 
         save_figure(plan_figure(plan, rules.cell), Path(config.picture), "picture")
     if plan["outcome"] != Outcome.SUCCESS.name.lower():
-        raise WorkFailed(f"policy {policy.name!r} did not reach the goal: {plan['outcome']} after {counted(len(plan['transfers']))}")
+        waiting = "; no arm moves any more" if plan["waiting"] else ""
+        made = counted(len(plan["transfers"]))
+        raise WorkFailed(f"policy {policy.name!r} did not reach the goal: {plan['outcome']} after {made}{waiting}")
     return 0
 
 
@@ -117,8 +124,15 @@ def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> N
         save_figure(motion_figure(motions, planner.model, planner.motion), Path(config.motion_picture), "motion_picture")
 
 
-def _planner(config: PlanConfig, rules: Rules) -> MotionPlanner | None:
-    """The arms' planner; None if no motion is asked for. Refuses settings it cannot use, under their key here, ``arm_motion``."""
+def _planner(config: PlanConfig, policy: SupervisorPolicy) -> MotionPlanner | None:
+    """The arms' planner; None if no motion is asked for. Refuses settings it cannot use, under their key here, ``arm_motion``.
+
+    Raises:
+        InvalidSetting: also for motions of a policy that makes its own: the planner's would be others.
+    """
+    for name in ("motion", "motion_picture"):
+        if getattr(config, name) and policy.variant == "centralised":
+            raise InvalidSetting(name, getattr(config, name), "left out with a centralised policy, whose motions are its own")
     if not (config.motion or config.motion_picture):
         for key, value in changed("arm_motion", config.arm_motion):
             raise InvalidSetting(key, value, "left out without motion=FILE or motion_picture=FILE")
@@ -128,7 +142,7 @@ def _planner(config: PlanConfig, rules: Rules) -> MotionPlanner | None:
     from marl_handover.motion.planner import MotionPlanner
 
     try:
-        return MotionPlanner(build_cell(rules.cell.config), config.arm_motion)
+        return MotionPlanner(build_cell(policy.rules.cell.config), config.arm_motion)
     except InvalidSetting as error:
         raise InvalidSetting(f"arm_{error.name}", error.value, error.limit) from error
     except UnknownChoice as error:
@@ -136,22 +150,27 @@ def _planner(config: PlanConfig, rules: Rules) -> MotionPlanner | None:
 
 
 def solve(policy: SupervisorPolicy, start: Floats, goal: Floats) -> dict[str, Any]:
-    """What the policy does with one problem, poses (3,), on exact kinematics: the content of ``plan … json=FILE``, mm and rad."""
+    """What the policy does with one problem, poses (3,), on exact kinematics: the content of ``plan … json=FILE``, mm and rad.
+
+    ``waiting`` says that it ended in a time-out because no arm is to move any more.
+    """
     rules = policy.rules
     pose, outcome = start, Outcome.NONE
     previous: Any = np.int64(NO_ARM)
     transfers: list[dict[str, Any]] = []
-    limit = rules.config.max_steps
-    while outcome is Outcome.NONE and len(transfers) < limit:
+    limit, waiting = rules.config.max_steps, False
+    while outcome is Outcome.NONE and not waiting and len(transfers) < limit:
         action = policy.act(pose, goal, previous)
         result = rules.step(pose, goal, previous, action, transfers_left=np.int64(limit - len(transfers)))
         external = int(result.external_arm)
+        waiting = external < 0 and bool(nobody_moves(action))
+        if waiting:
+            continue
         if int(result.transfers) > (external >= 0):
-            transfers.append(
-                _transfer(rules, int(result.command.arm), bool(result.command.final), pose, result.placed, bool(result.feasible))
-            )
+            transfers.append(_commanded(rules, pose, goal, result))
         if external >= 0:
-            transfers.append(_transfer(rules, external, True, result.placed, result.pose, True))
+            path_mm = float(rules.motion_cost(rules.cell, np.int64(external), result.placed[:2], result.pose[:2]))
+            transfers.append(_transfer(rules, external, True, result.placed, result.pose, path_mm, None))
         pose, previous = result.pose, result.previous_arm
         if result.terminated:
             outcome = Outcome(int(result.outcome))
@@ -167,16 +186,33 @@ def solve(policy: SupervisorPolicy, start: Floats, goal: Floats) -> dict[str, An
         "optimal_transfers": optimum or None,
         "outcome": (Outcome.TIMEOUT if outcome is Outcome.NONE else outcome).name.lower(),
         "transfers": transfers,
+        "waiting": waiting,
         "total_path_mm": sum(transfer["path_mm"] for transfer in transfers),
         "orientation_error_deg": math.degrees(rules.orientation_error(pose[2], goal[2])),
         "cell_settings": asdict(rules.cell.config),
     }
 
 
-def _transfer(rules: Rules, arm: int, final: bool, before: Floats, after: Floats, feasible: bool) -> dict[str, Any]:
+def _commanded(rules: Rules, pose: Floats, goal: Floats, result: Transition) -> dict[str, Any]:
+    """The entry of the policy's own transfer."""
+    command, feasible = result.command, bool(result.feasible)
+    motion = getattr(command, "motion", None)  # of a policy that makes its motions itself
+    if motion is None or not feasible:
+        path_mm = float(rules.motion_cost(rules.cell, command.arm, pose[:2], result.placed[:2]))
+    else:
+        ways = (np.asarray(part)[None] for part in (command.arm, pose[:2], result.placed[:2], motion))
+        path_mm = float(rules.path_mm(*ways)[0])  # type: ignore[attr-defined]
+    refusal = None
+    if not feasible:
+        reached = bool(Rules.transfer(rules, pose, goal, command)[1])
+        refusal = MOTION if reached else OUT_OF_REACH
+    return _transfer(rules, int(command.arm), bool(command.final), pose, result.placed, path_mm, refusal)
+
+
+def _transfer(rules: Rules, arm: int, final: bool, before: Floats, after: Floats, path_mm: float, refusal: str | None) -> dict[str, Any]:
     """One entry of ``transfers``. A final transfer goes to the goal, not to a place of the chart, so it has no alpha and beta."""
     alpha, beta = rules.cell.chart.from_table(after[:2])
-    inside = feasible and not final
+    inside = refusal is None and not final
     return {
         "arm": ARM_LETTERS[arm],
         "final": final,
@@ -184,8 +220,9 @@ def _transfer(rules: Rules, arm: int, final: bool, before: Floats, after: Floats
         "to": after.tolist(),
         "alpha": float(alpha) if inside else None,
         "beta": float(beta) if inside else None,
-        "path_mm": float(rules.motion_cost(rules.cell, np.int64(arm), before[:2], after[:2])),
-        "refused": not feasible,
+        "path_mm": path_mm,
+        "refused": refusal is not None,
+        "refusal": refusal,
     }
 
 
@@ -226,7 +263,7 @@ def _text(plan: dict[str, Any], rules: Rules) -> str:
     lines.append(row("0", "", "", plan["start"], note="start"))
     for number, transfer in enumerate(plan["transfers"], start=1):
         place = "" if transfer["alpha"] is None else f"{transfer['alpha']:+.3f}, {round(transfer['beta'], 3) + 0.0:+.3f}"
-        note = "refused: out of this arm's reach" if transfer["refused"] else place
+        note = f"refused: {REASONS[transfer['refusal']]}" if transfer["refused"] else place
         path = f"{transfer['path_mm']:.1f}"
         lines.append(row(str(number), transfer["arm"], "yes" if transfer["final"] else "no", transfer["to"], path, note))
     lines.append(row("goal", "", "", plan["goal"]))

@@ -19,6 +19,8 @@ from marl_handover.cell import Cell, build_cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import CellConfig, MotionConfig, TaskChanges, require_at_least, require_seed
 from marl_handover.errors import InvalidSetting, OutOfReach, WorkFailed
+from marl_handover.policies.policy import NobodyMoves
+from marl_handover.task.rules import Outcome
 
 if TYPE_CHECKING:
     from marl_handover.envs.handover_aec import HandoverEnv
@@ -72,6 +74,7 @@ def run(config: SimulateCommand) -> int:
     views = {"overview": OVERVIEW, "top": TOP}
     width, height = _check(config, tuple(views))
     policy = policies.adapted(config.policy, config.cell, config.seed, **vars(config.task))
+    policy.require_executors()
     for name in ("start", "goal"):
         _require_reach(policy.rules.cell, name, getattr(config, name))
     model = build_cell(policy.rules.cell.config)
@@ -173,14 +176,19 @@ def play(
     say: Callable[[str], None],
 ) -> Played:
     """Play one episode from where ``env`` was reset to; ``say`` gets one line a transfer."""
-    simulated, began = 0.0, time.perf_counter()
+    simulated, began, stopped = 0.0, time.perf_counter(), False
     goal = env.observe("supervisor")["goal"]
     say(f"object {_pose(backend.cell.object_pose())} to goal {_pose(goal)}")
     while not (env.terminations["supervisor"] or env.truncations["supervisor"]):
         agent = env.agent_selection
         observation = env.observe(agent)
         if agent == "supervisor":
-            env.step(supervisor(observation))
+            try:
+                env.step(supervisor(observation))
+            except NobodyMoves:
+                say("  no arm is to move any more")
+                stopped = True
+                break
             continue
         started, backend.last = time.perf_counter(), None
         action = arms[agent].act(observation)
@@ -194,8 +202,9 @@ def play(
             f"  {ARM_LETTERS[arms[agent].arm]} to ({observation['target'][0]:.1f} mm, {observation['target'][1]:.1f} mm): {came}; "
             f"object {_pose(backend.cell.object_pose())}; {seconds:.1f} s, {rate:.1f} x real time"
         )
-    outcome = str(env.infos["supervisor"]["outcome"])
-    played = Played(outcome, int(env.infos["supervisor"]["transfers"]), simulated, time.perf_counter() - began)
+    infos = env.infos["supervisor"]  # empty at the reset
+    outcome = Outcome.TIMEOUT.name.lower() if stopped else str(infos["outcome"])
+    played = Played(outcome, int(infos.get("transfers", 0)), simulated, time.perf_counter() - began)
     say(f"{outcome} after {played.transfers} transfers")
     return played
 

@@ -25,8 +25,8 @@ class FlatAEC(BaseWrapper):
 
     The supervisor acts with (4,): final, arm, alpha, beta, in [-1, 1] and read by their sign as :meth:`Rules.decode` does. ``infos`` of
     the supervisor are numbers, there from the reset on, so that TorchRL's wrapper hands them on: ``transfers`` so far, and of the last
-    command ``placed`` (3,), the pose it left, before architecture A's external transfer, and ``feasible``, 0 where the arm refused or the
-    command was ignored because the episode was solved at its start. Infos of arms are left out.
+    command ``placed`` (3,), the pose it left, before architecture A's external transfer, ``feasible``, 0 where the arm refused or the
+    command was ignored because the episode was solved at its start, and ``ignored``, 1 in the latter case. Infos of arms are left out.
 
     Args:
         env: the environment, wrapped or not.
@@ -80,7 +80,7 @@ class FlatAEC(BaseWrapper):
         """Note the result of a command; of architecture A's external transfer only that there was one."""
         made = self.infos[SUPERVISOR]["transfers"] + 1
         if self._commanded and external:
-            self._tell(made, before, False)
+            self._tell(made, before, False, ignored=True)
         elif self._commanded:
             refusal = self.env.infos[arm]["refusal"]
             self._tell(made, self._pose(), refusal is None or refusal in FAILURES)
@@ -88,9 +88,9 @@ class FlatAEC(BaseWrapper):
             self.infos[SUPERVISOR]["transfers"] = made
         self._commanded = False
 
-    def _tell(self, transfers: int, placed: Vector, feasible: bool) -> None:
+    def _tell(self, transfers: int, placed: Vector, feasible: bool, ignored: bool = False) -> None:
         self.infos = {agent: {} for agent in self.env.possible_agents}
-        self.infos[SUPERVISOR] = {"transfers": transfers, "placed": placed, "feasible": float(feasible)}
+        self.infos[SUPERVISOR] = {"transfers": transfers, "placed": placed, "feasible": float(feasible), "ignored": float(ignored)}
 
     def _pose(self) -> Vector:
         pose: Vector = self.env.observe(SUPERVISOR)["state"]

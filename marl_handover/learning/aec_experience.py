@@ -45,8 +45,8 @@ class AecExperience(Experience):
     ``num_envs`` environments are played side by side, shared out over the workers. A call plays about as many decisions and hands over the
     episodes that ended, in rows as :class:`EpisodeWriter` makes them. Episodes are judged solved at the epsilon that the policy was shown.
 
-    A checkpoint holds how many decisions were made, not the running episodes: those are given up, and others begin, of problems that the
-    run has not seen.
+    A checkpoint holds how many decisions were made and the random state of the replay's epsilons, not the running episodes: those are
+    given up, and others begin, of problems that the run has not seen.
 
     Args:
         env: the batched environment of the same cell and task, whose epsilon range and rule book are followed.
@@ -84,13 +84,15 @@ class AecExperience(Experience):
         return Collected(steps, rows, None, ended)
 
     def state_dict(self) -> dict[str, Any]:
-        """How far it is."""
-        return {"decisions": self.decisions}
+        """How far it is, and the random state of the batched environment, which draws epsilons for the memory."""
+        return {"decisions": self.decisions, "random": self.env.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`; what runs is given up."""
         self.close()
         self.decisions = int(state["decisions"])
+        if "random" in state:  # not in those of older versions
+            self.env.generator.set_state(state["random"].cpu())
 
     def close(self) -> None:
         """End the workers and close the environments."""
@@ -158,7 +160,7 @@ class AecExperience(Experience):
         first = torch.cat([ends.new_zeros(1), ends[:-1] + 1])
         length = ends + 1 - first
         elapsed = torch.arange(len(turns), device=ends.device) - first.repeat_interleave(length)
-        return TensorDict(
+        rows = TensorDict(
             {
                 "achieved_goal": pose,
                 "desired_goal": goal,
@@ -173,6 +175,9 @@ class AecExperience(Experience):
             },
             turns.batch_size,
         )
+        if self.env.rules.external_finish:  # without it, no command is ignored
+            rows["ignored"] = info["ignored"][:, None] > 0
+        return rows
 
 
 def _processes(makers: list[Callable[[], Any]], actors: list[Callable[[], Any]], frames: int) -> BaseCollector:

@@ -114,7 +114,7 @@ class AecPolicy(TensorDictModuleBase):
 
 
 class WorkerPolicy(AecPolicy):
-    """The same in another process, with a learner of its own that is told the trained one's weights and no more.
+    """The same in another process, with a learner of its own that is told the trained one's weights, how far training is, and no more.
 
     Its two parameters are what TorchRL keeps the same as the trainer's (:func:`message`).
 
@@ -140,14 +140,17 @@ class WorkerPolicy(AecPolicy):
         if not torch.equal(self._obeyed, self.weights):
             self._obeyed = self.weights.detach().clone()
             nn.utils.vector_to_parameters(self._obeyed, self._learner.actor().parameters())
-        mode, *bounds = self.orders.tolist()
+        mode, progress, *bounds = self.orders.tolist()
+        if progress != self._learner.progress:
+            self._learner.schedule(progress)
         self.explore = getattr(self._learner, MODES[int(mode)])
         self.epsilon_range_rad = (bounds[0], bounds[1])
         return super()._commands(seen, turn)
 
 
 def message(explore: Explore, epsilon_range_rad: tuple[float, float]) -> dict[str, Tensor]:
-    """What workers are told: ``weights`` of the learner's actor, and ``orders``: number of the method in :data:`MODES`, epsilon's range.
+    """What workers are told: ``weights`` of the learner's actor, and ``orders``: number of the method in :data:`MODES`, how much of the
+    training is done, and epsilon's range.
 
     Raises:
         TypeError: ``explore`` is none of these methods; other functions stay in the process they are in.
@@ -156,7 +159,7 @@ def message(explore: Explore, epsilon_range_rad: tuple[float, float]) -> dict[st
     if not isinstance(learner, Algorithm) or name not in MODES:
         raise TypeError(f"workers explore by an algorithm's {' or '.join(MODES)}, not by {explore!r}")
     weights = nn.utils.parameters_to_vector(learner.actor().parameters()).detach().cpu().clone()
-    return {"weights": weights, "orders": torch.tensor([MODES.index(name), *epsilon_range_rad])}
+    return {"weights": weights, "orders": torch.tensor([MODES.index(name), learner.progress, *epsilon_range_rad])}
 
 
 def width(space: Any) -> int:

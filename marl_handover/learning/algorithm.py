@@ -39,6 +39,7 @@ class Algorithm(ABC):
         self.rules, self.config, self.generator = rules, config.algorithm, generator
         self.device = torch.device(config.device)
         self.uniform = UniformActions(rules, config)
+        self.progress = 0.0  # how much of the training is done
 
     def blind(self, observation: Tensor) -> Tensor:
         """Uniform actions (n, action_size), to start with."""
@@ -74,6 +75,7 @@ class Algorithm(ABC):
 
     def schedule(self, fraction: float) -> None:
         """Set what changes in the course of training; ``fraction`` of it is done. Here: the learning rate."""
+        self.progress = fraction
         start = self.config.decay_from
         left = 1.0 if fraction <= start or start >= 1.0 else max(0.0, (1.0 - fraction) / (1.0 - start))
         for part in self.modules().values():

@@ -15,7 +15,7 @@ from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.algorithm import Algorithm
 from marl_handover.learning.decentralised_sac import DecentralisedSac
 from marl_handover.learning.experience import BatchedExperience, Experience
-from marl_handover.learning.rollout import Episodes, play
+from marl_handover.learning.rollout import Act
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.turn_replay import TurnReplay
 from marl_handover.learning.variants import Variant
@@ -44,8 +44,8 @@ class Decentralised(Variant):
         learners = config.decentralised.learners
         return TurnReplay(_turn_rules(env.rules), config.replay, env, generator, learners != "ctde", learners == "independent")
 
-    def play(self, algorithm: Algorithm, start: Tensor, goal: Tensor) -> Episodes:
-        """Episodes of the deterministic policies, L first, on problems (n, 3), (n, 3). Two passes in a row are a time-out."""
+    def policy(self, algorithm: Algorithm) -> Act:
+        """The deterministic policies as one supervisor, L first. Two passes in a row: no arm moves."""
         rules = _turn_rules(algorithm.rules)
 
         def asked(pose: Tensor, goal: Tensor, turn: Tensor) -> Tensor:
@@ -60,7 +60,7 @@ class Decentralised(Variant):
             answer = one_where(passed, asked(pose, goal, 1 - first), answer)
             return one_where(rules.passes(answer), torch.full_like(pose[:, :1], torch.nan), rules.supervisor_action(answer, turn))
 
-        return play(rules, act, start, goal)
+        return act
 
 
 def _turn_rules(rules: object) -> TurnRules:

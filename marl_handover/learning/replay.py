@@ -1,9 +1,12 @@
 """Hindsight replay that is right for this problem.
 
 TorchRL's :class:`HERReplayBuffer` relabels goal and reward. Here the end flag, the final flag and the observations change
-with the goal too: a hand-over by arm b that left the object at s' is exactly what the *final* action of b would have done
+with the goal too: a hand-over by arm b that was to leave the object at s' is exactly what the *final* action of b would have done
 had the goal been s'. So this subclass stores what does not depend on the goal, and derives the rest from the rule book at
 sampling time, at the present epsilon.
+
+Where placements are not exact, s' is where the command would have put the object on exact arms, not where it was measured: that
+action aimed at s' and missed it by the noise, or by a missed grasp, and the relabelled one is judged by just that.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from marl_handover.arrays import one_where, wrap
 from marl_handover.cell.symmetry import GROUP
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.settings import ReplayConfig
-from marl_handover.task.rules import Rules
+from marl_handover.task.rules import Command, Rules, carried
 
 STORED = ("achieved_goal", "desired_goal", "previous_arm", "action", "placed", "feasible", "epsilon", "terminated")
 
@@ -95,7 +98,12 @@ class HindsightReplayBuffer(HERReplayBuffer):
         return self._judge(batch)[0]
 
     def _judge(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        verdict = self.rules.judge(batch["placed"], batch["desired_goal"], batch["final"], batch["feasible"][:, 0], batch["epsilon"][:, 0])
+        placed, goal, epsilon = batch["placed"], batch["desired_goal"], batch["epsilon"][:, 0]
+        verdict = self.rules.judge(placed, goal, batch["final"], batch["feasible"][:, 0], epsilon)
+        if self.rules.external_finish and self.rules.noisy:  # the transfer that ends it may miss
+            external = self.rules.external(placed, goal, epsilon_rad=epsilon)
+            left = one_where(external.arm >= 0, self._landed(external.pose), placed)
+            verdict = self.rules.external_verdict(left, goal, external.arm, epsilon)
         arm = self.rules.decode(batch["action"]).arm
         reward = verdict.reward - self.rules.motion_penalty(arm, batch["achieved_goal"], batch["placed"])
         return reward[:, None], verdict.terminated[:, None]
@@ -136,25 +144,48 @@ class HindsightReplayBuffer(HERReplayBuffer):
         # A final placement depends on its goal: it can only be told what it did itself. A refused one did nothing.
         true = batch["feasible"][:, 0] & source["feasible"][:, 0] & (own | ~batch["final"])
         chosen &= true & self._still_stored(index, offset)
-        goal = self._near_miss(source["placed"], batch["epsilon"][:, 0])
+        goal = self._near_miss(self._aim(source), batch["epsilon"][:, 0])
         batch["desired_goal"] = one_where(chosen, goal, batch["desired_goal"])
+        if self.rules.noisy:
+            # A later goal knows where this row's noise took the object: from there it was reached. Without that knowledge it is any draw.
+            batch["placed"] = one_where(chosen & ~own, self._landed(self._aim(batch)), batch["placed"])
         if not self.rules.external_finish:
             batch["final"] = batch["final"] | (chosen & own)
         batch["hindsight"] = chosen[:, None]
+
+    def _aim(self, rows: TensorDictBase) -> Tensor:
+        """Where the stored commands (n,), all of them carried out, would have put the object on exact arms: (n, 3)."""
+        if not self.rules.measured:
+            return rows["placed"]
+        # The plain kinematics: whether a motion is allowed was judged when it was made.
+        return Rules.transfer(self.rules, rows["achieved_goal"], rows["desired_goal"], self._command(rows))[0]
+
+    def _command(self, rows: TensorDictBase) -> Command:
+        """The commands (n,) of stored rows."""
+        return self.rules.decode(rows["action"])
+
+    def _landed(self, pose: Tensor) -> Tensor:
+        """Where objects that are put at ``pose`` (n, 3) come to lie: displaced by noise, where the task has that."""
+        if not self.rules.noisy:
+            return pose
+        noise = self.rules.config.noise
+        offset = self.env._normal(len(pose), noise.position_mm, noise.yaw_deg)
+        return carried(pose, pose[:, :2] + offset[:, :2], offset[:, 2])
 
     def _finish_externally(self, batch: TensorDictBase) -> None:
         """Architecture A: whether the command was ignored, because the episode was solved at its start, depends on goal and epsilon.
 
         A command that was ignored when it was stored is executed now if it would be; one that would be ignored leaves the object.
+        What an arm refused it refuses again. Rows of the rule book need not say which was which: it refuses by the kinematics alone.
         """
         if not self.rules.external_finish:
             return
         pose, goal = batch["achieved_goal"], batch["desired_goal"]
         moved, feasible = self.rules.transfer(pose, goal, self.rules.decode(batch["action"]))
-        idle = ~batch["feasible"][:, 0]
+        idle = batch["ignored"][:, 0] if "ignored" in batch.keys() else ~batch["feasible"][:, 0]  # noqa: SIM118 - a TensorDict
         solved = self.rules.can_finish(pose, goal, batch["epsilon"][:, 0]).any(-1)
         batch["feasible"] = ((batch["feasible"][:, 0] | (idle & feasible)) & ~solved)[:, None]
-        batch["placed"] = one_where(solved, pose, one_where(idle, moved, batch["placed"]))
+        batch["placed"] = one_where(solved, pose, one_where(idle & feasible, self._landed(moved), batch["placed"]))
 
     def _near_miss(self, goal: Tensor, epsilon: Tensor) -> Tensor:
         """Some goals turned a little. What was achieved then misses them, or just not: exact hindsight alone only ever shows

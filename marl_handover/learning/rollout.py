@@ -51,7 +51,8 @@ def play(
 ) -> Episodes:
     """Play every problem, pose and goal (n, 3), to its end. Only running episodes are computed.
 
-    Where no arm is to move, a policy that says the same of the same object will never move one: a time-out at once, without a transfer.
+    Where no arm is to move, a policy that says the same of the same object will never move one: a time-out at once. The decision that the
+    observer sees has no transfer, but the episode has used up all it had, or waiting for ever would be the quickest way to end.
     """
     xp = namespace(pose)
     count, limit = len(pose), rules.config.max_steps
@@ -75,10 +76,11 @@ def play(
             noise=None if noise is None else noise(len(here)),
             final_noise=None if noise is None else noise(len(here)),
         )
-        result = _without_idle(result, action)
+        idle = nobody_moves(action) & (result.external_arm < 0)
+        result = _without(result, idle)
         if observer is not None:
             observer(Decision(running, here, there, previous, made, result))
-        total = made + result.transfers
+        total = xp.where(idle, limit, made + result.transfers)
         over = result.terminated | (total >= limit)
         verdict = xp.where(result.terminated, result.outcome, int(Outcome.TIMEOUT))
         outcome, transfers = _put(outcome, running, verdict), _put(transfers, running, total)
@@ -88,10 +90,14 @@ def play(
     return Episodes(outcome, transfers, ended)
 
 
-def _without_idle(result: Transition, action: Array) -> Transition:
-    """The result of a decision, with a time-out where no arm was to move (and, in architecture A, none moved by itself)."""
-    xp = namespace(action)
-    idle = xp.isnan(action).any(-1) & (result.external_arm < 0)
+def nobody_moves(action: Array) -> Array:
+    """Where a policy says that no arm is to move: bool (...) of actions (..., size), which are not numbers there."""
+    return namespace(action).isnan(action).any(-1)
+
+
+def _without(result: Transition, idle: Array) -> Transition:
+    """The result of decisions, with a time-out and no transfer where these were ``idle`` (n,)."""
+    xp = namespace(result.pose)
     if not bool(idle.any()):
         return result
     return result._replace(

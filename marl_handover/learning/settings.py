@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from marl_handover.config import (
     HINDSIGHT,
@@ -10,6 +11,7 @@ from marl_handover.config import (
     CentralisedConfig,
     DecentralisedConfig,
     TaskConfig,
+    changed,
     require_at_least,
     require_between,
     require_choice,
@@ -22,7 +24,10 @@ from marl_handover.learning.algorithm_settings import AlgorithmConfig, OffPolicy
 
 @dataclass
 class HindsightConfig:
-    """Relabelling of sampled transitions; every relabelled transition is a true one of the problem."""
+    """Relabelling of sampled transitions; every relabelled transition is a true one of the problem, under noise as often as it would be.
+
+    But for goals from later in an episode where noise is not the task's own (physics), or arms take turns: these know where it went.
+    """
 
     strategy: str = "future"  # none, final, future or episode: which later poses of the episode become goals
     ratio: float = 0.5  # share of transitions that get a hindsight goal
@@ -126,22 +131,38 @@ class TrainConfig:
         if self.variant == "decentralised":
             self._validate_decentralised()
         self._validate_source()
+        self._refuse_idle()
 
     def _validate_centralised(self) -> None:
         """What that variant cannot do."""
         limits = (
             ("task.architecture", self.task.architecture, "B", "whose policy moves the last time too"),
             ("task.reward.motion_weight", self.task.reward.motion_weight, 0.0, "whose paths have no price"),
-            ("replay.symmetry", self.replay.symmetry, False, "whose networks fold the symmetry"),
+            ("replay.symmetry", self.replay.symmetry, False, "whose memory does not mirror motions"),
         )
         for name, value, only, reason in limits:
             if value != only:
                 raise InvalidSetting(name, value, f"{only} with variant=centralised, {reason}")
 
+    def _refuse_idle(self) -> None:
+        """Raise :class:`InvalidSetting` for a setting that was changed where nothing reads it."""
+        for name, own in (("centralised", self.centralised), ("decentralised", self.decentralised)):
+            if self.variant != name:
+                for key, value in changed(name, own):
+                    raise InvalidSetting(key, value, f"left out without variant={name}")
+        if self.collector == "local" and self.workers != TrainConfig().workers:
+            raise InvalidSetting("workers", self.workers, "left out without collector=multiprocess or ray")
+
     def _validate_decentralised(self) -> None:
         """What that variant cannot do, or does not need."""
         self.decentralised.validate_task(self.task)
-        limits = (("source", self.source, "batched"), ("replay.correct_terminated", self.replay.correct_terminated, True))
+        noise = self.task.noise
+        limits: tuple[tuple[str, Any, Any], ...] = (
+            ("source", self.source, "batched"),
+            ("replay.correct_terminated", self.replay.correct_terminated, True),
+            ("task.noise.observed_mm", noise.observed_mm, 0.0),  # its learners see the memory's poses as they are
+            ("task.noise.observed_deg", noise.observed_deg, 0.0),
+        )
         for name, value, only in limits:
             if value != only:
                 raise InvalidSetting(name, value, f"{only} with variant=decentralised")

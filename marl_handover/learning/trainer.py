@@ -110,12 +110,15 @@ class Trainer:
         self.counters.step += collected.steps
         self.recent += collected.ended
         self.counters.episodes += int(collected.ended[0])
-        self.algorithm.schedule(min(1.0, self.counters.step / self.config.steps))
+        self._schedule()
         if isinstance(config, OffPolicyConfig):
             self._learn_from_replay(collected, config)
         elif isinstance(config, PpoConfig):
             assert collected.transition is not None
             self._learn_from_rollout(collected.transition, config)
+
+    def _schedule(self) -> None:
+        self.algorithm.schedule(min(1.0, self.counters.step / self.config.steps))
 
     def _learn_from_replay(self, collected: Collected, config: OffPolicyConfig) -> None:
         if collected.rows is not None:
@@ -191,7 +194,10 @@ class Trainer:
         }
 
     def evaluate(self) -> dict[str, float]:
-        """Success rate, mean steps and ratio to the optimum of the deterministic policy on the run's own validation problems."""
+        """Success rate, mean steps and ratio to the optimum of the deterministic policy on the run's own validation problems.
+
+        With the noise of the task, if it has any. Mean steps count ``task.max_steps`` for an episode in which no arm moves any more.
+        """
         generator = torch.Generator(device=self.device).manual_seed(VALIDATION_SEED + self.config.seed)
         start, goal = sample_problems(self.rules.cell, self.config.evaluation_episodes, generator, torch.float32)
         episodes = self.variant.play(self.algorithm, start, goal)
@@ -254,6 +260,8 @@ class Trainer:
             raise CheckpointMismatch(self.folder, "architecture", _architecture(stored), self.config.task.architecture)
         self.counters = Counters(**state["counters"])
         self.algorithm.load_state_dict(state["algorithm"])
+        if self.counters.step:
+            self._schedule()
         self.experience.load_state_dict(state["experience"])
         if state["replay"]["rows"] is not None:
             rows = TensorDict.from_dict(state["replay"]["rows"], auto_batch_size=True, batch_dims=1)

@@ -17,6 +17,7 @@ from marl_handover.cell.symmetry import GROUP
 from marl_handover.envs.decentralised import DecentralisedEnv, TurnRules
 from marl_handover.learning.replay import HindsightReplayBuffer
 from marl_handover.learning.settings import ReplayConfig
+from marl_handover.task.rules import Command
 
 
 class _Choice(NamedTuple):
@@ -108,14 +109,22 @@ class TurnReplay(HindsightReplayBuffer):
         passed, final, _ = self._choice(batch)
         own = (source["placed"] == batch["placed"]).all(-1)  # also if nothing but passes followed
         free = torch.where(own, ~passed, ~final & (~batch["answered"][:, 0] | (offset == 1)))
-        elsewhere = (source["placed"] != batch["achieved_goal"]).any(-1)  # or the object would lie at its goal already
+        aim = one_where(own, self._aim(batch), self._aim(source))
+        elsewhere = (aim != batch["achieved_goal"]).any(-1)  # or the object would lie at its goal already
         true = batch["feasible"][:, 0] & source["feasible"][:, 0] & free & elsewhere
         chosen &= true & self._still_stored(index, offset)
-        goal = self._near_miss(source["placed"], batch["epsilon"][:, 0])
+        goal = self._near_miss(aim, batch["epsilon"][:, 0])
         batch["desired_goal"] = one_where(chosen, goal, batch["desired_goal"])
         number = torch.where(chosen & own, 1.0, batch["action"][:, 0])
         batch["action"] = torch.cat([number[:, None], batch["action"][:, 1:]], -1)
         batch["hindsight"] = chosen[:, None]
+
+    def _aim(self, rows: TensorDictBase) -> Tensor:
+        passed = self.rules.passes(rows["action"])
+        return one_where(passed, rows["achieved_goal"], super()._aim(rows))
+
+    def _command(self, rows: TensorDictBase) -> Command:
+        return self.rules.command(rows["action"], self.rules.turn_of(rows["previous_arm"][:, 0]))
 
     def _offset(self, batch: TensorDictBase) -> Tensor:
         """How many rows on, within its episode, each row's new goal is."""

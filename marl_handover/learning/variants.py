@@ -6,13 +6,16 @@
 from __future__ import annotations
 
 import importlib
+import math
+from dataclasses import replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from marl_handover.cell import Cell, load_cell
-from marl_handover.config import TaskConfig
+from marl_handover.config import NoiseConfig, TaskConfig
+from marl_handover.envs.backends import NoisyBackend
 from marl_handover.envs.handover_aec import HandoverEnv
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.errors import InvalidSetting, UnknownChoice
@@ -24,10 +27,12 @@ from marl_handover.learning.experience import BatchedExperience, Experience
 from marl_handover.learning.hybrid_sac import HybridSac
 from marl_handover.learning.ppo import Ppo
 from marl_handover.learning.replay import HindsightReplayBuffer
-from marl_handover.learning.rollout import Episodes, play
+from marl_handover.learning.rollout import Act, Episodes, play
 from marl_handover.learning.settings import VARIANTS, TrainConfig
 from marl_handover.task.observations import observe
-from marl_handover.task.rules import Rules
+from marl_handover.task.rules import Rules, carried
+
+VALIDATION_NOISE_SEED = 2_000_000_001
 
 
 class Variant:
@@ -44,7 +49,10 @@ class Variant:
         rules = None
         if config.source == "aec" and config.backend != "kinematic":
             # Arms that are not exact keep to a part of the chart and are judged by what is measured; all of them alike.
-            rules = HandoverEnv(backend="noisy", cell=config.cell, task=config.task).rules
+            arms = HandoverEnv(backend="noisy", cell=config.cell, task=config.task)
+            assert isinstance(arms.backend, NoisyBackend)
+            task = replace(arms.rules.config, noise=arms.backend.noise if config.backend == "noisy" else NoiseConfig())
+            rules = Rules(arms.rules.cell, task, arms.rules.motion_cost, physical=True)
         return SupervisorEnv(config.num_envs, load_cell(config.cell), config.task, device, seed=config.seed + 1, rules=rules)
 
     def experience(self, env: SupervisorEnv, config: TrainConfig) -> Experience:
@@ -75,14 +83,34 @@ class Variant:
         return self.algorithms[name](rules, config, generator)
 
     def play(self, algorithm: Algorithm, start: Tensor, goal: Tensor) -> Episodes:
-        """Episodes of the deterministic policy on problems (n, 3), (n, 3), for validation."""
+        """Episodes of the deterministic policy on problems (n, 3), (n, 3), for validation, with all noise of the task, always the same."""
+        rules = algorithm.rules
+        settings, generator = rules.config.noise, torch.Generator(device=start.device).manual_seed(VALIDATION_NOISE_SEED)
+
+        def offsets(count: int, position_mm: float, yaw_deg: float) -> Tensor:
+            scale = start.new_tensor([position_mm, position_mm, math.radians(yaw_deg)])
+            return torch.randn(count, 3, generator=generator, device=start.device) * scale
+
+        def noise(count: int) -> Tensor:
+            return offsets(count, settings.position_mm, settings.yaw_deg)
+
+        act = self.policy(algorithm)
+
+        def mistaken(pose: Tensor, goal: Tensor, previous: Tensor) -> Tensor:
+            offset = offsets(len(pose), settings.observed_mm, settings.observed_deg)
+            return act(carried(pose, pose[:, :2] + offset[:, :2], offset[:, 2]), goal, previous)
+
+        return play(rules, mistaken if settings.observed else act, start, goal, noise=noise if rules.noisy else None)
+
+    def policy(self, algorithm: Algorithm) -> Act:
+        """The deterministic policy as a function of batches, torch: pose (n, 3), goal (n, 3), previous arm (n,) -> action (n, 4)."""
         rules = algorithm.rules
         layout, epsilon = rules.config.layout, rules.epsilon_rad
 
         def act(pose: Tensor, goal: Tensor, previous: Tensor) -> Tensor:
             return algorithm.act(observe(rules, layout, pose, goal, previous, epsilon))
 
-        return play(rules, act, start, goal)
+        return act
 
 
 def make_variant(name: str) -> Variant:

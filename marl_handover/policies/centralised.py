@@ -56,8 +56,8 @@ class CentralisedPolicy(NetworkPolicy):
             raise self._refusal()
         return super().under(rules)
 
-    def __call__(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """Refused: where a supervisor is asked, executors move the arms.
+    def require_executors(self) -> None:
+        """Refused: its motions are its own.
 
         Raises:
             InvalidSetting: always.

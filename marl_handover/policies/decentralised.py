@@ -40,21 +40,40 @@ class TurnsPolicy(NetworkPolicy):
 
     def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
         """What the first arm that does not pass wants: its likeliest branch, and the mean place."""
-        previous = np.asarray(previous_arm)
-        both = observe(self.rules, "relative", pose, goal, np.full_like(previous, NO_ARM)).astype(np.float32)
+        logits, places = self._said(pose, goal)
+        branch = logits.argmax(-1)
+        first = np.where(np.asarray(previous_arm) == 0, 1, 0)
+        arm = np.where(select(branch, first) == PASS, 1 - first, first)
+        chosen = select(branch, arm)
+        return np.where((chosen == PASS)[..., None], math.nan, self._decision(arm, chosen, places))
+
+    def alternatives(self, action: Floats, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        """All branches of the arm that was to act, the likeliest first, then all of the other one's; nobody passes."""
+        logits, places = self._said(pose, goal)
+        logits[..., PASS] = -math.inf
+        order = np.argsort(-logits, -1, kind="stable")[..., :-1]
+        arm = np.where(action[..., 1] > 0, 1, 0)
+        ranked = [(asked, np.take_along_axis(order, asked[..., None, None], -2)[..., 0, :]) for asked in (arm, 1 - arm)]
+        found = [self._decision(asked, branches[..., rank], places) for asked, branches in ranked for rank in range(branches.shape[-1])]
+        return np.stack(found, -2)
+
+    def _said(self, pose: Floats, goal: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Logits (..., arms, 2 + modes) of each arm's branches, and its places (..., arms, modes, 2) on the table."""
+        both = observe(self.rules, "relative", pose, goal, np.full(np.shape(pose)[:-1], NO_ARM)).astype(np.float32)
         blocks = both.reshape(*both.shape[:-1], -1, len(ARM_FIELDS))
         sign = self._sign(blocks)
         out = self._asked(self._harmonics(np.where(sign[..., None] < 0, blocks * self.odd, blocks)))
         modes = self.about["modes"]
-        branch = out[..., : PLACE + modes].argmax(-1)
         places = np.tanh(out[..., PLACE + modes : PLACE + 3 * modes]).reshape(*out.shape[:-1], modes, 2)
-        place = np.take_along_axis(places, np.maximum(branch - PLACE, 0)[..., None, None], -2)[..., 0, :]
-        first = np.where(previous == 0, 1, 0)
-        arm = np.where(select(branch, first) == PASS, 1 - first, first)
-        chosen = select(branch, arm)
-        alpha, beta = select(place[..., 0] * sign, arm), select(place[..., 1], arm) * self.beta_sign[arm]
-        action = np.stack([np.where(chosen == FINISH, 1.0, -1.0), 2.0 * arm - 1.0, alpha, beta], -1)
-        return np.where((chosen == PASS)[..., None], math.nan, action)
+        signs = np.stack(np.broadcast_arrays(sign, self.beta_sign), -1)
+        return out[..., : PLACE + modes], places * signs[..., None, :]
+
+    @staticmethod
+    def _decision(arm: NDArray[np.int64], branch: NDArray[np.int64], places: NDArray[np.float32]) -> Floats:
+        """Actions (..., 4) of branches (...) of arms (...)."""
+        own = np.take_along_axis(places, arm[..., None, None, None], -3)[..., 0, :, :]
+        place = np.take_along_axis(own, np.asarray(np.maximum(branch - PLACE, 0))[..., None, None], -2)[..., 0, :]
+        return np.stack([np.where(branch == FINISH, 1.0, -1.0), 2.0 * arm - 1.0, place[..., 0], place[..., 1]], -1)
 
     def _asked(self, blocks: NDArray[np.float32]) -> NDArray[np.float32]:
         """Outputs (..., arms, outputs) of each arm's network for its block."""

@@ -16,9 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.errors import WorkFailed
 from marl_handover.task.rules import Rules
 
 Floats = NDArray[np.float64]
+
+
+class NobodyMoves(WorkFailed):
+    """A policy was asked for a command, and wants no arm to move."""
+
+    def __init__(self, policy: str) -> None:
+        self.policy = policy
+        super().__init__(f"policy {policy!r} wants no arm to move; asked the same again it says the same, so it will never move one")
 
 
 class SupervisorPolicy(ABC):
@@ -38,7 +47,7 @@ class SupervisorPolicy(ABC):
 
     @abstractmethod
     def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
-        """Actions: final, arm, alpha, beta."""
+        """Actions: final, arm, alpha, beta. One that is not a number: no arm is to move."""
 
     def alternatives(self, action: Floats, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
         """What it would rather do if it could not do ``action`` (..., size): (..., k, size), the best first.
@@ -55,8 +64,19 @@ class SupervisorPolicy(ABC):
         other.rules = rules
         return other
 
+    def require_executors(self) -> None:  # noqa: B027 - most do
+        """Raise :class:`InvalidSetting` if it does not leave the motions to executors. Here: it does."""
+
     def __call__(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """The AEC supervisor's action for its observation."""
+        """The AEC supervisor's action for its observation.
+
+        Raises:
+            InvalidSetting: of a policy whose motions are its own: where a supervisor is asked, executors move the arms.
+            NobodyMoves: it wants no arm to move, which is no action there.
+        """
+        self.require_executors()
         pose, goal = np.asarray(observation["state"], float), np.asarray(observation["goal"], float)
         action = self.act(pose, goal, np.asarray(observation["previous_arm"]) - 1)
+        if np.isnan(action).any():
+            raise NobodyMoves(self.name)
         return {"final": int(action[0] > 0), "arm": int(action[1] > 0), "place": np.asarray(action[2:], np.float32)}

@@ -19,6 +19,8 @@ class ShieldedPolicy(SupervisorPolicy):
     first of the policy's own :meth:`~SupervisorPolicy.alternatives` that does not; every other decision stays as it is. They include a
     hand-over by either arm, so one of them is possible wherever any arm reaches the object; where none does, nothing is repaired.
 
+    That no arm is to move is left alone as well: arms that take turns and wait for each other are no failure one step ahead.
+
     Attributes:
         inner: the policy.
         repaired: decisions that were repaired since it was made.
@@ -33,6 +35,10 @@ class ShieldedPolicy(SupervisorPolicy):
     def under(self, rules: Rules) -> SupervisorPolicy:
         """The same policy and the shield under another rule book; it counts anew."""
         return ShieldedPolicy(self.inner.under(rules))
+
+    def require_executors(self) -> None:
+        """As the policy."""
+        self.inner.require_executors()
 
     def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
         """The policy's decision, or what it is repaired to."""

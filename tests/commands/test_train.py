@@ -118,6 +118,9 @@ def test_a_run_is_not_overwritten(finished, capsys):
         ("algorithm.modes=0", ("algorithm.modes",)),
         ("algorithm.layout=raw", ("algorithm.layout", "relative")),
         ("resume=nowhere", ("nowhere",)),
+        ("centralised.motion=flat", ("centralised.motion", "variant=centralised")),
+        ("decentralised.pass_reward=-1", ("decentralised.pass_reward", "variant=decentralised")),
+        ("workers=3", ("workers", "collector=multiprocess or ray")),
         ("seed=100000000000000000000", ("seed",)),
     ],
 )

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
 from marl_handover.compose import compose
+from marl_handover.config import NoiseConfig
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.replay import EpisodeWriter, HindsightReplayBuffer
@@ -58,13 +61,13 @@ def table():
 def replay_of(paper, rules_of):
     """``replay_of(architecture, steps, **settings)``: a memory of 16 cells that were played by arms that do reach the object.
 
-    Keywords of :class:`HindsightConfig` and of :class:`ReplayConfig`, and ``finals``: the share of final actions.
+    Keywords of :class:`HindsightConfig` and of :class:`ReplayConfig`; ``finals``: the share of final actions; ``noise`` of the task.
     """
 
-    def make(architecture="B", steps=60, finals=0.1, seed=0, epsilon_deg=5.0, **settings):
+    def make(architecture="B", steps=60, finals=0.1, seed=0, epsilon_deg=5.0, noise=None, **settings):
         hindsight = HindsightConfig(**{key: settings.pop(key) for key in list(settings) if key in HindsightConfig.__annotations__})
         config = ReplayConfig(**{"capacity": 4000, **settings}, hindsight=hindsight)
-        task = rules_of(paper, architecture, epsilon_deg=epsilon_deg).config
+        task = replace(rules_of(paper, architecture, epsilon_deg=epsilon_deg).config, noise=noise or NoiseConfig())
         env = SupervisorEnv(16, paper, task, seed=seed)
         random = torch.Generator().manual_seed(seed + 1)
         replay = HindsightReplayBuffer(env.rules, config, env, random)

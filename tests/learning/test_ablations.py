@@ -16,8 +16,11 @@ from marl_handover.errors import InvalidSetting
 from marl_handover.learning.evaluation import evaluate, random_problems
 from marl_handover.learning.export import policy_arrays, save_policy
 from marl_handover.learning.trainer import Trainer
+from marl_handover.learning.variants import make_variant
 from marl_handover.policies import SupervisorPolicy
+from marl_handover.policies.baselines import ExactPolicy
 from marl_handover.task.observations import ARM_FIELDS, RAW_FIELDS, observe
+from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules
 
 
@@ -144,6 +147,24 @@ class Recording(SupervisorPolicy):
     def act(self, pose, goal, previous_arm):
         self.shown = pose if self.shown is None else self.shown
         return self.inner.act(pose, goal, previous_arm)
+
+
+@pytest.mark.parametrize("noise", ["{position_mm:2,yaw_deg:2}", "{observed_mm:4,observed_deg:4}"])
+@pytest.mark.parametrize("variant", ["hierarchical", "decentralised"])
+def test_validation_plays_with_the_noise_of_the_task(paper, small, variant, noise):
+    """An exact policy, watched as a run watches its learner: perfect without noise, and the same imperfect result each time with it."""
+    start, goal = sample_problems(paper, 300, torch.Generator().manual_seed(2), torch.float32)
+    formulation, results = make_variant(variant), []
+    for given in ([], [f"task.noise={noise}"]):
+        config = small("sac", f"variant={variant}", "task.epsilon_deg=3", *given)
+        learner = formulation.algorithm(formulation.rules(paper, config.task, config), config, torch.Generator())
+        exact = ExactPolicy(Rules(paper, config.task))
+        formulation.policy = lambda algorithm, exact=exact: lambda *problem: torch.tensor(exact.act(*(part.numpy() for part in problem)))
+        played = [formulation.play(learner, start, goal) for _ in range(2)]
+        assert torch.equal(played[0].outcome, played[1].outcome)
+        results.append(float((played[0].outcome == int(Outcome.SUCCESS)).float().mean()))
+    assert results[0] > 0.99
+    assert 0.2 < results[1] < 0.95
 
 
 def test_evaluation_shows_the_policy_a_displaced_object(paper):

@@ -8,6 +8,7 @@ import re
 import shlex
 import signal
 import warnings
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
@@ -15,9 +16,10 @@ import torch
 
 from marl_handover.commands import train
 from marl_handover.compose import compose
-from marl_handover.config import MotionConfig
+from marl_handover.config import MotionConfig, NoiseConfig
 from marl_handover.errors import HandoverError
 from marl_handover.learning.aec_experience import AecExperience, WorkerLost
+from marl_handover.learning.aec_policy import WorkerPolicy, make_env, message
 from marl_handover.learning.experience import BatchedExperience
 from marl_handover.learning.trainer import Trainer
 from marl_handover.learning.variants import make_variant
@@ -133,12 +135,55 @@ def test_a_run_that_goes_on_begins_other_problems(begin):
     experience, learner = begin()
     rows, steps, _ = gather(experience, learner.blind, 2)
     state = experience.state_dict()
-    assert state == {"decisions": steps}
+    assert state["decisions"] == steps
     other, learner = begin()
     other.load_state_dict(state)
     later, more, _ = gather(other, learner.blind, 2)
-    assert other.state_dict() == {"decisions": steps + more}
+    assert other.state_dict()["decisions"] == steps + more
     assert not set(map(tuple, rows["desired_goal"].tolist())) & set(map(tuple, later["desired_goal"].tolist()))
+
+
+def test_a_run_that_goes_on_draws_the_memorys_next_epsilons(begin):
+    experience, _ = begin()
+    experience.env.set_epsilon_range(1.0, 10.0)
+    experience.env.draw_epsilon(5)
+    state = experience.state_dict()
+    expected = experience.env.draw_epsilon(5)
+    other, _ = begin()
+    other.env.set_epsilon_range(1.0, 10.0)
+    other.load_state_dict({"decisions": 0})  # as older versions wrote it
+    other.load_state_dict(state)
+    assert torch.equal(other.env.draw_epsilon(5), expected)
+
+
+def test_a_command_that_was_ignored_is_told_from_one_that_an_arm_refused(begin):
+    experience, learner = begin("task.architecture=A", "num_envs=12", "task.epsilon_deg=60", "task.max_steps=6")
+    rows, _, _ = gather(experience, learner.blind, 12)
+    rules = experience.env.rules
+    problem = rows["achieved_goal"].double(), rows["desired_goal"].double()
+    solved = rules.can_finish(*problem).any(-1)
+    assert torch.equal(rows["ignored"][:, 0], solved)
+    refused = ~rows["feasible"][:, 0] & ~solved
+    assert min(int(solved.sum()), int(refused.sum())) > 3
+    assert not rules.transfer(*problem, rules.decode(rows["action"].double()))[1][refused].any()
+
+
+def test_workers_explore_as_far_as_training_is(small):
+    """DQN's share of random choices falls in the workers as it does here."""
+    config = small("dqn", "source=aec", "algorithm.random_end=0.1", "algorithm.random_until=0.5")
+    config.validate()
+    variant = make_variant(config.variant)
+    rules = variant.env(config, torch.device("cpu")).rules
+    learner = variant.algorithm(rules, config, torch.Generator().manual_seed(0))
+    worker = WorkerPolicy(deepcopy(config), 1, 5)
+    seen = make_env(config, [3]).reset()
+    for fraction in (0.0, 0.25, 0.5, 1.0):
+        learner.schedule(fraction)
+        told = message(learner.explore, (0.1, 0.1))
+        worker.weights.data, worker.orders.data = told["weights"], told["orders"]
+        worker(seen)
+        assert worker._learner.random_share == pytest.approx(learner.random_share)
+    assert worker._learner.random_share == pytest.approx(0.1)
 
 
 def test_a_run_learns_from_it_stops_and_goes_on(small, tmp_path, table):
@@ -183,7 +228,7 @@ def test_what_cannot_be_is_refused_by_name(settings, name):
 
 
 def test_noisy_arms_are_judged_by_what_is_measured(begin):
-    """A hand-over lands beside its place; a final one is good within the tolerance, and so is hindsight's."""
+    """A hand-over lands beside its place; a final one is good within the tolerance, and so is hindsight's, whose goal is where it aimed."""
     experience, learner = begin("backend=noisy", "task.noise.position_mm=2", "task.noise.yaw_deg=1", "num_envs=40")
     rows, _, _ = gather(experience, learner.blind, 3)
     rules = experience.env.rules
@@ -194,6 +239,24 @@ def test_noisy_arms_are_judged_by_what_is_measured(begin):
     assert (feasible | ~rows["feasible"][:, 0]).all()
     off = (rows["placed"] - planned)[moved][:, :2]
     assert 1.0 < float(off.std()) < 3.0
+    replay = make_variant(experience.config.variant).replay(experience.env, experience.config, torch.Generator().manual_seed(0))
+    replay.extend(rows)
+    batch = replay.sample(3000)
+    missed = (batch["next", "achieved_goal"] - batch["desired_goal"])[:, :2].norm(dim=-1)
+    turned = rules.orientation_error(batch["next", "achieved_goal"][:, 2], batch["desired_goal"][:, 2]).abs()
+    carried = (batch["next", "achieved_goal"] != batch["achieved_goal"]).any(-1)
+    for finals in (batch["final"] & batch["hindsight"], batch["final"] & ~batch["hindsight"]):
+        rows_of = finals[:, 0] & carried
+        good = (missed <= 5.0) & (turned <= batch["epsilon"][:, 0])
+        assert torch.equal(batch["next", "reward"][rows_of, 0], torch.where(good, 20.0, -30.0)[rows_of])
+        assert 1.0 < float(missed[rows_of].mean()) < 4.0
+
+
+def test_noisy_arms_are_watched_with_their_noise(begin):
+    """The backend's own if the task has none; physics has none that is known."""
+    experience, _ = begin("backend=noisy")
+    assert experience.env.rules.config.noise == NoiseConfig(position_mm=1.0, yaw_deg=0.5)
+    assert not begin("backend=bullet", "executor=optimised")[0].env.rules.noisy
 
 
 def only_finishing(learner):

@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from marl_handover import policies
+from marl_handover import cli, policies
 from marl_handover.cell.symmetry import GROUP
+from marl_handover.commands.plan import solve
 from marl_handover.errors import InvalidSetting, UnknownChoice
 from marl_handover.learning.centralised_sac import with_actions
 from marl_handover.learning.export import policy_arrays, save_policy
 from marl_handover.learning.trainer import Trainer
 from marl_handover.learning.variants import make_variant
 from marl_handover.motion.ways import mirrored_numbers
+from marl_handover.policies import SupervisorPolicy
 from marl_handover.runtime.assessment import AssessmentConfig, assess
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Rules
@@ -179,9 +181,49 @@ def test_executors_do_not_make_its_motions(trained, backend):
         assess(AssessmentConfig(policy=str(trained.folder), episodes=1, backend=backend), progress=False)
 
 
-def test_it_does_not_play_the_supervisor_of_other_arms(trained):
+@pytest.mark.parametrize("prefix", ["", "shielded:"])
+def test_it_does_not_play_the_supervisor_of_other_arms(trained, prefix):
     with pytest.raises(InvalidSetting, match="motions are its own"):
-        policies.load(str(trained.folder))({"state": [0.0, 100.0, 1.0], "goal": [10.0, -120.0, -2.0], "previous_arm": 0})
+        policies.load(f"{prefix}{trained.folder}")({"state": [0.0, 100.0, 1.0], "goal": [10.0, -120.0, -2.0], "previous_arm": 0})
+
+
+@pytest.mark.parametrize("key", ["motion", "motion_picture"])
+@pytest.mark.parametrize("prefix", ["", "shielded:"])
+def test_plan_does_not_write_the_executors_motions(trained, tmp_path, capsys, prefix, key):
+    file = tmp_path / "motion.png"
+    assert cli.main(["plan", f"policy={prefix}{trained.folder}", f"{key}={file}"]) == 2
+    assert f"{key} = " in capsys.readouterr().err
+    assert not file.exists()
+
+
+class Scripted(SupervisorPolicy):
+    """Always the same action."""
+
+    def __init__(self, rules, action):
+        super().__init__(rules, "scripted")
+        self.action = action
+
+    def act(self, pose, goal, previous_arm):
+        return self.action
+
+
+def test_plan_tells_the_policys_own_paths_and_why_it_was_refused(trained):
+    """A motion of straight first guesses, a wild one, and a pick-up far from the arm."""
+    rules, near, far, goal = trained.rules, [0.0, 0.0, 0.0], [0.0, -240.0, 0.0], np.array([150.0, 60.0, 1.0])
+    left, straight, tried = [-1.0, -1.0, 0.2, 0.3], np.zeros(NUMBERS), np.sign(np.random.default_rng(0).normal(size=(50, NUMBERS)))
+    commands = rules.decode(np.concatenate([np.tile(left, (50, 1)), tried], -1))
+    wild = tried[~rules.transfer(np.tile(near, (50, 1)), np.tile(goal, (50, 1)), commands)[1]][0]
+    plans = [
+        solve(Scripted(rules, np.concatenate([left, motion])), np.array(start), goal)
+        for start, motion in ((near, straight), (near, wild), (far, straight))
+    ]
+    first = [plan["transfers"][0] for plan in plans]
+    assert [transfer["refusal"] for transfer in first] == [None, "motion", "out_of_reach"]
+    assert [transfer["refused"] for transfer in first] == [False, True, True]
+    ends = (np.array([first[0][key][:2]]) for key in ("from", "to"))
+    assert first[0]["path_mm"] == pytest.approx(rules.path_mm(np.array([0]), *ends, straight[None])[0])
+    assert first[0]["path_mm"] > np.linalg.norm(np.subtract(first[0]["to"], first[0]["from"])[:2]) + 0.1
+    assert first[1]["path_mm"] == 0.0
 
 
 def test_a_saved_run_goes_on_as_it_would_have(small, table, tmp_path):
@@ -206,7 +248,9 @@ def test_a_saved_run_goes_on_as_it_would_have(small, table, tmp_path):
         ("task.architecture=A", "architecture"),
         ("task.reward.motion_weight=1", "motion_weight"),
         ("replay.symmetry=true", "symmetry"),
+        ("replay.symmetry=true", "does not mirror motions"),
         ("source=aec", "source"),
+        ("decentralised.learners=shared", "decentralised.learners"),
         ("centralised.offset_rad=0", "offset_rad"),
         ("centralised.control_points=5", "control_points"),
     ],

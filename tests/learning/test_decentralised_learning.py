@@ -212,14 +212,14 @@ def test_each_arm_asks_its_own_network(learner_of, paper, learners):
     assert torch.equal(before[right], after[right]) is (learners == "independent")
 
 
-def test_episodes_in_which_both_pass_time_out_without_a_transfer(learner_of, variant, paper):
+def test_episodes_in_which_both_pass_time_out_and_have_used_up_their_time(learner_of, variant, paper):
     learner = learner_of("shared")
     problems = sample_problems(paper, 50, torch.Generator().manual_seed(1), torch.float32)
     with torch.no_grad():
         learner.actors[0].net[-1].bias[PASS] += 1e3
     episodes = variant.play(learner, *problems)
     assert (episodes.outcome == int(Outcome.TIMEOUT)).all()
-    assert not episodes.transfers.any()
+    assert (episodes.transfers == learner.rules.config.max_steps).all()
     assert torch.equal(episodes.pose, problems[0])
     assert learner.parts[0][0].actor.modes == 1
     assert PLACE == PASS + 1
@@ -244,10 +244,10 @@ def test_nobody_moves_where_the_policy_says_nothing(paper, rules_of, architectur
     idle = (goal[:, 0] > 0) & (whole.transfers > first)
     assert idle.sum() > 30
     assert (cut.outcome[idle] == int(Outcome.TIMEOUT)).all()
-    assert (cut.transfers[idle] == 1).all()
+    assert (cut.transfers[idle] == rules.config.max_steps).all(), "or waiting for ever would shorten the mean"
     for part, kept in zip(cut, whole, strict=True):
         assert (part[~idle] == kept[~idle]).all()
-    assert sum(shown) == cut.transfers.sum()
+    assert sum(shown) == cut.transfers[~idle].sum() + idle.sum(), "what is seen of an idle one is its single transfer"
 
 
 @pytest.mark.parametrize("learners", LEARNERS)
@@ -306,6 +306,10 @@ def test_only_transfers_count_as_steps(small, tmp_path):
     [
         ("task.architecture=A", "architecture"),
         ("source=aec", "source"),
+        ("task.noise.observed_mm=1", "task.noise.observed_mm"),
+        ("task.noise.observed_deg=1", "task.noise.observed_deg"),
+        ("centralised.motion=flat", "centralised.motion"),
+        ("workers=3", "workers"),
         ("replay.correct_terminated=false", "correct_terminated"),
         ("replay.capacity=900", "capacity"),
         ("algorithm.batch_size=33", "batch_size"),

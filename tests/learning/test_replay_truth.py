@@ -7,7 +7,10 @@ import math
 import pytest
 import torch
 
+from marl_handover.config import NoiseConfig
+from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.replay import HindsightReplayBuffer
+from marl_handover.learning.settings import HindsightConfig, ReplayConfig
 from marl_handover.task.rules import Rules
 
 
@@ -70,6 +73,90 @@ def test_observations_are_those_of_the_relabelled_problem(replay_of):
     found = batch["next", "observation"][going].double()
     difference = (expected[going] - found).abs()
     assert (difference.max(-1).values < 1e-2).double().mean() > 0.99  # a wrapped angle may jump at its cut
+
+
+NOISE = NoiseConfig(position_mm=2.0, yaw_deg=2.0)
+
+
+def noisy_again(replay, batch):
+    """The sampled decisions, taken again with noise of their own."""
+    random = torch.Generator().manual_seed(77)
+    scale = torch.tensor([2.0, 2.0, math.radians(2.0)])
+    draws = [torch.randn(len(batch), 3, generator=random) * scale for _ in range(2)]
+    previous, epsilon = torch.full((len(batch),), -1), batch["epsilon"][:, 0]
+    problem = batch["achieved_goal"], batch["desired_goal"], previous, batch["action"]
+    return replay.rules.step(*problem, epsilon_rad=epsilon, noise=draws[0], final_noise=draws[1])
+
+
+@pytest.mark.parametrize("epsilon_deg", [1.0, 5.0])
+@pytest.mark.parametrize("strategy", ["final", "future"])
+@pytest.mark.parametrize("architecture", ["A", "B"])
+def test_under_noise_memory_tells_of_as_many_successes_as_there_are(replay_of, architecture, strategy, epsilon_deg):
+    replay = replay_of(architecture, steps=500, capacity=10000, strategy=strategy, ratio=0.8, epsilon_deg=epsilon_deg, noise=NOISE)
+    batch = replay.sample(12000)
+    batch = batch[batch["hindsight"][:, 0] & (batch["final"][:, 0] | (architecture == "A"))]
+    truth = noisy_again(replay, batch)
+    told, real = (
+        float((reward == (20 if architecture == "B" else 0)).float().mean()) for reward in (batch["next", "reward"], truth.reward)
+    )
+    assert 0.02 < real < 0.95
+    assert abs(told - real) < 0.05
+    ends = batch["next", "terminated"].float().mean() - truth.terminated.float().mean()
+    assert abs(float(ends)) < 0.05
+
+
+def test_under_noise_a_later_goal_does_not_choose_this_rows_noise(replay_of):
+    """How often some arm could finish from where a hand-over was told to have left the object."""
+    replay = replay_of("B", steps=400, finals=0.0, ratio=1.0, near_miss_ratio=0.0, random_ratio=0.0, epsilon_deg=2.0, noise=NOISE)
+    batch = replay.sample(12000)
+    batch = batch[batch["hindsight"][:, 0] & ~batch["final"][:, 0]]
+    goal, epsilon = batch["desired_goal"], batch["epsilon"][:, 0]
+    places = batch["next", "achieved_goal"], noisy_again(replay, batch).placed
+    told, real = (float(replay.rules.can_finish(pose, goal, epsilon).any(-1).float().mean()) for pose in places)
+    assert 0.1 < real < 0.9
+    assert abs(told - real) < 0.05
+
+
+def test_a_missed_grasp_is_a_failure_in_hindsight(made_up_episodes, paper, rules_of):
+    """On arms whose placements are measured: the gripper closed, opened at its place, and the object was still where it had been."""
+    rules = Rules(paper, rules_of(paper).config, physical=True)
+    env = SupervisorEnv(1, paper, rules.config, seed=0, rules=rules)
+    config = ReplayConfig(capacity=100, hindsight=HindsightConfig(strategy="final", ratio=1.0, near_miss_ratio=0.0, random_ratio=0.0))
+    replay = HindsightReplayBuffer(rules, config, env, torch.Generator().manual_seed(0))
+    rows = made_up_episodes([1, 1])
+    rows["achieved_goal"] = torch.tensor([[-20.0, 10.0, 0.5], [15.0, -12.0, 1.0]])
+    rows["action"] = torch.tensor([[-1.0, -1.0, 0.5, 0.5], [-1.0, 1.0, -0.5, 0.2]])
+    planned, able = rules.transfer(rows["achieved_goal"], rows["desired_goal"], rules.decode(rows["action"]))
+    assert able.all()
+    rows["placed"] = torch.stack([rows["achieved_goal"][0], planned[1]])
+    replay.extend(rows)
+    batch = replay.sample(200)
+    assert batch["hindsight"].all()
+    assert batch["final"].all()
+    missed = (batch["next", "achieved_goal"] == batch["achieved_goal"]).all(-1)
+    assert 0 < missed.sum() < 200
+    assert torch.equal(batch["next", "reward"][:, 0], torch.where(missed, -30.0, 20.0))
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_in_a_what_an_arm_refused_it_refuses_again(made_up_episodes, paper, rules_of, ignored):
+    """A command that was ignored, as the episode was solved at its start, is carried out once told of another goal."""
+    rules = rules_of(paper, "A")
+    env = SupervisorEnv(1, paper, rules.config, seed=0)
+    config = ReplayConfig(capacity=100, hindsight=HindsightConfig(strategy="none"))
+    replay = HindsightReplayBuffer(rules, config, env, torch.Generator().manual_seed(0))
+    rows = made_up_episodes([1])
+    rows["achieved_goal"] = rows["placed"] = torch.tensor([[-20.0, 10.0, 0.5]])
+    rows["desired_goal"] = torch.tensor([[120.0, -120.0, 2.5]])
+    rows["action"] = torch.tensor([[-1.0, -1.0, 0.5, 0.5]])
+    rows["feasible"] = torch.zeros(1, 1, dtype=torch.bool)
+    rows["ignored"] = torch.full((1, 1), ignored)
+    planned, able = rules.transfer(rows["achieved_goal"], rows["desired_goal"], rules.decode(rows["action"]))
+    assert able.all()
+    assert not rules.can_finish(rows["achieved_goal"], rows["desired_goal"]).any()
+    replay.extend(rows)
+    expected = planned if ignored else rows["achieved_goal"]
+    torch.testing.assert_close(replay.sample(20)["next", "achieved_goal"], expected.expand(20, 3))
 
 
 def test_strategy_none_relabels_nothing(replay_of):

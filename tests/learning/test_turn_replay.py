@@ -10,26 +10,25 @@ import torch
 
 from marl_handover.cell import load_cell
 from marl_handover.cell.symmetry import GROUP
-from marl_handover.config import DecentralisedConfig, TaskConfig
+from marl_handover.config import DecentralisedConfig, NoiseConfig, TaskConfig
 from marl_handover.envs.decentralised import DecentralisedEnv
 from marl_handover.learning.replay import EpisodeWriter
 from marl_handover.learning.settings import HindsightConfig, ReplayConfig
 from marl_handover.learning.turn_replay import TurnReplay
 
 
-def environment(decisions):
-    return DecentralisedEnv(
-        16, load_cell("paper"), TaskConfig(max_steps=6), seed=0, settings=DecentralisedConfig(decisions_per_transfer=decisions)
-    )
+def environment(decisions, noise=0.0):
+    task = TaskConfig(max_steps=6, noise=NoiseConfig(position_mm=noise, yaw_deg=noise))
+    return DecentralisedEnv(16, load_cell("paper"), task, seed=0, settings=DecentralisedConfig(decisions_per_transfer=decisions))
 
 
 @cache
-def played(decisions):
+def played(decisions, noise=0.0):
     """Whole episodes of 16 cells in which arms that reach the object pass it on, wait, and now and then end it; some are refused."""
-    env, random, rows = environment(decisions), torch.Generator().manual_seed(1), []
+    env, random, rows = environment(decisions, noise), torch.Generator().manual_seed(1), []
     writer = EpisodeWriter(16, env.rules.max_decisions, env.device)
     current = env.reset()
-    for _ in range(80):
+    for _ in range(300 if noise else 80):
         action = torch.rand(16, 3, generator=random) * 2 - 1
         able = env.rules.cell.reaches(current["achieved_goal"]).gather(-1, 1 - current["previous_arm"])[:, 0]
         refused, final, waits = (torch.rand(16, generator=random) < share for share in (0.05, 0.1, 0.2))
@@ -46,12 +45,12 @@ def played(decisions):
 def memory_of():
     """``memory_of(**settings)``: a memory of what was :func:`played`."""
 
-    def make(to_next_turn=True, separate=False, decisions=3, **settings):
+    def make(to_next_turn=True, separate=False, decisions=3, noise=0.0, **settings):
         hindsight = HindsightConfig(**{key: settings.pop(key) for key in list(settings) if key in HindsightConfig.__annotations__})
         config = ReplayConfig(**{"capacity": 4000, **settings}, hindsight=hindsight)
-        env = environment(decisions)
+        env = environment(decisions, noise)
         replay = TurnReplay(env.rules, config, env, torch.Generator().manual_seed(2), to_next_turn, separate)
-        replay.extend(played(decisions).clone())
+        replay.extend(played(decisions, noise).clone())
         return replay
 
     return make
@@ -176,6 +175,22 @@ def test_separate_learners_never_get_the_other_arms_turns(memory_of, symmetry):
         assert direct or (symmetry and mirrored)
         turned += not direct
     assert bool(turned) is symmetry
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_under_noise_memory_tells_of_as_many_successes_as_there_are(memory_of, kind):
+    """Finished again, with noise of its own; and a pass leaves the object exactly where it is."""
+    replay = memory_of(*KINDS[kind], noise=2.0, ratio=0.8, random_ratio=0.0)
+    batch = replay.sample(12000)
+    passed = replay.rules.passes(batch["action"])
+    assert torch.equal(batch["next", "pose"][passed], batch["pose"][passed])
+    batch = batch[batch["hindsight"] & replay.rules.command(batch["action"], batch["turn"]).final]
+    scale = torch.tensor([2.0, 2.0, math.radians(2.0)])
+    noise = torch.randn(len(batch), 3, generator=torch.Generator().manual_seed(7)) * scale
+    truth = replay.rules.take_turn(batch["pose"], batch["goal"], batch["turn"], batch["action"], batch["epsilon"], noise)
+    told, real = (float((reward == 20).float().mean()) for reward in (batch["next", "reward"], truth.reward))
+    assert 0.3 < real < 0.95
+    assert abs(told - real) < 0.05
 
 
 def test_shared_learners_get_all_four_mirror_images(memory_of):
