@@ -37,6 +37,9 @@ COMMANDS: dict[str, Command] = {
     "compare": Command("a suite of runs over seeds: statistics, tables, figures", "marl_handover.commands.compare"),
     "tune": Command("search for better settings of training, as an Optuna study", "marl_handover.commands.tune"),
     "simulate": Command("play episodes in the PyBullet cell: text, MP4 or GIF", "marl_handover.commands.simulate"),
+    "calibrate": Command("camera and servos of a cell, or of its twin: measured, saved and checked", "marl_handover.commands.calibrate"),
+    "run": Command("the closed loop on hardware or its twin; dry_run=true moves nothing", "marl_handover.commands.run"),
+    "stop": Command("stop all arms, and keep them stopped until clear=true", "marl_handover.commands.stop"),
     "emulate": Command("a servo controller on a pseudo-terminal, with faults if wanted", "marl_handover.commands.emulate"),
     "plot": Command("a figure of a run, a trace or a cell", "marl_handover.commands.plot"),
 }

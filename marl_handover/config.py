@@ -253,9 +253,9 @@ class LoopConfig:
 class DecentralisedConfig:
     """variant=decentralised: two arms that take turns, without a supervisor.
 
-    A pass earns half of what a transfer does. To pass for ever then earns -10 at the usual discount, less than any solution, so it does not
-    pay; and as the discount counts decisions, a pass costs about half a transfer, so that waiting for the arm that can finish, or that had
-    better begin, is cheaper than a transfer too many.
+    A pass costs half of what a transfer does. To pass for ever then earns -10 at the usual discount, less than any solution, so it does not
+    pay. As the discount counts decisions, delay included, a pass costs about three quarters of a transfer: waiting for the arm that can
+    finish, or that had better begin, is cheaper than a transfer too many.
     """
 
     learners: str = "ctde"  # independent (nothing shared), shared (one learner for both), ctde (shared actor, centralised critic)
@@ -275,7 +275,7 @@ class DecentralisedConfig:
             raise InvalidSetting("architecture", task.architecture, "B with variant=decentralised, where finishing is a decision")
 
 
-def changed(name: str, settings: LoopConfig | MotionConfig) -> list[tuple[str, Any]]:
+def changed(name: str, settings: LoopConfig | MotionConfig | CentralisedConfig | DecentralisedConfig) -> list[tuple[str, Any]]:
     """Key and value of every setting of group ``name`` that is not the default."""
     usual = asdict(type(settings)())
     return [(f"{name}.{key}", value) for key, value in asdict(settings).items() if value != usual[key]]

@@ -67,3 +67,13 @@ def assert_same_angle():
         np.testing.assert_allclose(np.remainder(difference + np.pi, 2 * np.pi) - np.pi, 0, atol=atol)
 
     return check
+
+
+@pytest.fixture(scope="session")
+def twin_calibration(tmp_path_factory):
+    """A folder of what ``calibrate`` finds on the twin, with fewer postures than usual."""
+    from marl_handover.cli import main
+
+    folder = tmp_path_factory.mktemp("calibration")
+    assert main(["calibrate", "hardware=twin", f"calibration={folder}", "postures=24", f"hardware.stop_file={folder / 'stop'}"]) == 0
+    return folder

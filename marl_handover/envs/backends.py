@@ -198,6 +198,8 @@ BACKENDS = {
     "kinematic": f"{__name__}:KinematicBackend",
     "noisy": f"{__name__}:NoisyBackend",
     "bullet": "marl_handover.simulation.backend:BulletBackend",
+    "twin": "marl_handover.runtime.hardware_backend:TwinBackend",
+    "hardware": "marl_handover.runtime.hardware_backend:HardwareBackend",
 }
 """Name -> "module:Class", imported at use: the environments need no simulator."""
 
@@ -206,7 +208,7 @@ def make_backend(name: str, model: CellModel, task: TaskConfig, motion: MotionCo
     """A backend by name; ``noisy`` takes the task's noise, if there is any.
 
     Args:
-        name: ``kinematic``, ``noisy`` or ``bullet``.
+        name: ``kinematic``, ``noisy``, ``bullet``, ``twin`` or ``hardware``.
         model: the cell.
         task: the task's settings.
         motion: how the arms move.

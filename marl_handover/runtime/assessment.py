@@ -24,6 +24,7 @@ from marl_handover.config import (
     require_seed,
 )
 from marl_handover.errors import InvalidSetting
+from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.learning.evaluation import Evaluation, decision_time, evaluate, random_problems, read_problems
 from marl_handover.learning.rollout import Decision, Episodes
 from marl_handover.learning.trace import Trace
@@ -34,7 +35,7 @@ from marl_handover.task.rules import Rules
 
 Floats = NDArray[np.float64]
 
-BACKENDS = ("kinematic", "noisy", "bullet")
+BACKENDS = ("kinematic", "noisy", "bullet", "twin")
 
 
 @dataclass
@@ -42,15 +43,17 @@ class AssessmentConfig:
     """Who is judged, where, on which problems. What is not given is the policy's own, or the default."""
 
     policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
-    backend: str = "kinematic"  # where transfers are executed: kinematic, or in closed loop with planned motions noisy or bullet
+    backend: str = "kinematic"  # where transfers are executed: kinematic, or in closed loop with planned motions noisy, bullet or twin
     episodes: int = 1000  # random problems
     seed: int = 0  # of the problems and of execution noise
     cell: CellConfig | None = None  # single keys change the paper cell
     task: TaskChanges = field(default_factory=TaskChanges)  # task.noise left out: of noisy, 1 mm and 0.5 deg
     grasp: str | None = None  # of bullet: friction or constraint; null: friction
     missed_grasps: float | None = None  # of noisy: probability that the fingers close on nothing; null: 0.01
-    loop: LoopConfig = field(default_factory=LoopConfig)  # of noisy and bullet
-    motion: MotionConfig = field(default_factory=MotionConfig)  # of noisy and bullet
+    loop: LoopConfig = field(default_factory=LoopConfig)  # of all but kinematic
+    motion: MotionConfig = field(default_factory=MotionConfig)  # of all but kinematic
+    calibration: str | None = None  # of twin: folder of its calibration; null: runs/calibration/twin
+    hardware: HardwareConfig | None = None  # of twin: single keys change its electronics; ports are always the emulated ones
     problems: str = ""  # JSON Lines of problems instead of random ones
 
     def validate(self) -> None:
@@ -128,7 +131,7 @@ def _play_loop(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool,
     """One problem after the other, in closed loop."""
     # Planner and simulator are imported where they are needed: the kinematic evaluation starts without them.
     from marl_handover.envs.backends import NoisyBackend
-    from marl_handover.runtime.evaluation import loop_report, play_problems
+    from marl_handover.runtime.evaluation import loop_report, play_problems, true_outcome
     from marl_handover.runtime.loop import make_loop
     from marl_handover.runtime.trace import trace_text
 
@@ -139,13 +142,20 @@ def _play_loop(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool,
         problems = _problems(config, rules)
         with _bar(problems, progress) as bar:
             played = play_problems(loop, problems, config.seed, bar.update)
-    outcomes, steps = (np.array(values) for values in zip(*((int(e.outcome), len(e.first)) for e in played), strict=True))
+    outcomes, steps = (np.array(values) for values in zip(*((int(true_outcome(e, rules)), len(e.first)) for e in played), strict=True))
     episodes = Episodes(outcomes, steps, np.stack([episode.first[-1].done.pose for episode in played]))
     optimal = ExactPlanner(rules).plan(*problems).transfers
     result = Evaluation(episodes, optimal, decision_time(loop.policy.under(rules).act, problems), time.perf_counter() - started)
-    own = {"noise": backend.noise.report(), "missed_grasps": backend.missed_grasps} if isinstance(backend, NoisyBackend) else options
+    own = (
+        {"noise": backend.noise.report(), "missed_grasps": backend.missed_grasps} if isinstance(backend, NoisyBackend) else _shown(options)
+    )
     settings = {"chart_inset": rules.cell.config.chart_inset, "position_tolerance_mm": rules.config.position_tolerance_mm, **own}
     return result, lambda: trace_text(played, rules), rules, {**loop_report(played, rules), **settings, **_repaired(loop.policy)}
+
+
+def _shown(options: dict[str, Any]) -> dict[str, Any]:
+    """Options as a report has them."""
+    return {name: asdict(value) if isinstance(value, HardwareConfig) else value for name, value in options.items()}
 
 
 def _repaired(policy: SupervisorPolicy) -> dict[str, Any]:
@@ -166,13 +176,13 @@ def backend_options(config: AssessmentConfig) -> dict[str, Any]:
     if config.backend == "kinematic":
         for key, value in changed("loop", config.loop) + changed("motion", config.motion):
             raise InvalidSetting(key, value, "left out with backend=kinematic, which plans no motions; or backend=noisy or bullet")
-    owners = {"grasp": "bullet", "missed_grasps": "noisy"}
+    owners = {"grasp": "bullet", "missed_grasps": "noisy", "calibration": "twin", "hardware": "twin"}
     given = {name: getattr(config, name) for name in owners if getattr(config, name) is not None}
     for name, value in given.items():
         if owners[name] != config.backend:
             raise InvalidSetting(name, value, f"left out, or backend={owners[name]}")
-    if config.backend == "bullet" and config.task.noise is not None:
-        raise InvalidSetting("task.noise", asdict(config.task.noise), "left out with backend=bullet, where physics decides")
+    if config.backend in ("bullet", "twin") and config.task.noise is not None:
+        raise InvalidSetting("task.noise", asdict(config.task.noise), f"left out with backend={config.backend}, where physics decides")
     if config.backend == "noisy" and config.task.noise is not None:
         if config.task.noise.observed:
             raise InvalidSetting("task.noise", asdict(config.task.noise), "without observed_mm and observed_deg, or backend=kinematic")

@@ -18,16 +18,17 @@ SAME_MM, SAME_RAD = 0.01, 1e-4
 """Poses nearer than this are the same: nothing was moved."""
 
 
-def moved(before: Floats, after: Floats) -> bool:
+def moved(before: Floats, after: Floats, same_mm: float = SAME_MM, same_rad: float = SAME_RAD) -> bool:
     """Whether an object measured at pose ``before`` (3,) is elsewhere, or turned, at ``after`` (3,)."""
-    return bool(abs(after[:2] - before[:2]).max() >= SAME_MM or abs(wrap(after[2] - before[2])) >= SAME_RAD)
+    return bool(abs(after[:2] - before[:2]).max() >= same_mm or abs(wrap(after[2] - before[2])) >= same_rad)
 
 
 class Done(NamedTuple):
     """What came of an order to an arm.
 
     ``pose`` (3,) measured afterwards; ``refusal``: a value of :class:`~marl_handover.envs.cycle_check.Refusal`, or None; ``detail``: the
-    arm's words about it; ``planning_ms``; ``duration_s`` and ``path_mm`` of the motion, 0 if there was none.
+    arm's words about it; ``planning_ms``; ``duration_s`` and ``path_mm`` of the motion, 0 if there was none; ``truth`` (3,): where the
+    object truly is then, None where nobody knows better than ``pose``.
     """
 
     pose: Floats
@@ -36,6 +37,12 @@ class Done(NamedTuple):
     planning_ms: float = 0.0
     duration_s: float = 0.0
     path_mm: float = 0.0
+    truth: Floats | None = None
+
+    @property
+    def true(self) -> Floats:
+        """The best there is: ``truth``, else ``pose``."""
+        return self.pose if self.truth is None else self.truth
 
     @property
     def tried(self) -> bool:
@@ -72,6 +79,7 @@ class Transfer:
 
     Attributes:
         attempt: 0 up to the first verdict; every later verdict counts one on.
+        goal: (3,) at the time.
         order: what the arm was told.
         before: (3,) measured pose.
         previous_arm: index, -1 for none.
@@ -82,6 +90,7 @@ class Transfer:
     """
 
     attempt: int
+    goal: Floats
     order: Order
     before: Floats
     previous_arm: int
@@ -96,12 +105,12 @@ class Transfer:
         """Whether its attempt ends here."""
         return self.terminated or self.truncated
 
-    def repeats(self, other: Transfer) -> bool:
-        """Whether both are the same order about an object that has not moved, refused both times."""
+    def repeats(self, other: Transfer, same_mm: float = SAME_MM, same_rad: float = SAME_RAD) -> bool:
+        """Whether both are the same order about an object that has not moved, refused both times; as far as measuring can tell."""
         mine, its = self.order, other.order
         if self.done.tried or other.done.tried or (mine.arm, mine.final) != (its.arm, its.final):
             return False
-        return not moved(self.before, other.before) and bool(abs(mine.place_mm - its.place_mm).max() < SAME_MM)
+        return not moved(self.before, other.before, same_mm, same_rad) and bool(abs(mine.place_mm - its.place_mm).max() < same_mm)
 
 
 @dataclass(frozen=True)
@@ -109,7 +118,7 @@ class Episode:
     """A whole episode.
 
     Attributes:
-        goal: (3,).
+        goal: (3,), the last one if it was changed.
         transfers: in order.
         ended: ``success``, ``transfers`` (none left) or ``stuck``.
         wall_s: wall-clock time it took.

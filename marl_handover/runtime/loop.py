@@ -19,13 +19,15 @@ from marl_handover.config import LoopConfig, MotionConfig
 from marl_handover.envs.backends import Backend, make_backend
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.errors import HandoverError
+from marl_handover.learning.rollout import nobody_moves
 from marl_handover.motion.cost import motion_cost
 from marl_handover.motion.executor import ROLL_RAD
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import OutOfArmsReach, TransferMotion
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.runtime.episode import Done, Episode, Order, Transfer, moved
+from marl_handover.runtime.episode import SAME_MM, SAME_RAD, Done, Episode, Order, Transfer, moved
 from marl_handover.runtime.reach import drawn_in
+from marl_handover.runtime.watching import Haltable, Inset, Truthful, Watchful
 from marl_handover.task.rules import Outcome, Rules, Verdict
 
 Floats = NDArray[np.float64]
@@ -70,32 +72,56 @@ class ClosedLoop:
         self.rules: Rules = policy.rules
         self.settings.validate(self.rules.config.max_steps)
         self.limit = self.settings.transfers
+        self._same = backend.same if isinstance(backend, Watchful) else (SAME_MM, SAME_RAD)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if kind is not None and isinstance(self.backend, Haltable):
+            self.backend.halt()
         self.backend.close()
 
-    def play(self, start: Floats, goal: Floats, seed: int = 0, observer: Observer | None = None) -> Episode:
-        """One problem, start and goal (3,) in mm and rad, to its end; ``observer`` is shown every transfer once it is judged."""
+    def play(
+        self, start: Floats, goal: Floats, seed: int = 0, observer: Observer | None = None, goals: Callable[[], Floats] | None = None
+    ) -> Episode:
+        """One problem, start and goal (3,) in mm and rad, to its end.
+
+        Args:
+            start: where the object is, or is put.
+            goal: where it is to go.
+            seed: of the backend.
+            observer: is shown every transfer once it is judged.
+            goals: the goal at present, asked before every decision and at the end; a transfer under way when it changes is finished.
+        """
         begun = time.perf_counter()
         run = _Run(np.asarray(goal, float), self.backend.reset(np.asarray(start, float), seed))
-        while run.ended is None:
+        while self._goes_on(run, goals):
             first = len(run.transfers)
             self._decide(run)
-            self._conclude(run)
+            if run.ended is None:
+                self._conclude(run)
             if observer is not None:
                 for transfer in run.transfers[first:]:
                     observer(transfer)
-        return Episode(run.goal, tuple(run.transfers), run.ended, time.perf_counter() - begun)
+        return Episode(run.goal, tuple(run.transfers), str(run.ended), time.perf_counter() - begun)
+
+    def _goes_on(self, run: _Run, goals: Callable[[], Floats] | None) -> bool:
+        """Take up a new goal, and an object that somebody moved; whether there is anything left to do."""
+        if goals is not None and moved(run.goal, goal := np.asarray(goals(), float)):
+            run.goal = goal
+            if len(run.transfers) < self.limit:
+                run.ended = None
+        if run.ended is None and isinstance(self.backend, Watchful):
+            run.pose = self.backend.watch()
+        return run.ended is None
 
     def _decide(self, run: _Run) -> None:
         """One decision: the policy's order and, in architecture A, the final transfer of an object that can be finished."""
         if self._finish(run):
             return
         self._order(run)
-        if run.transfers[-1].terminated or len(run.transfers) >= self._room(run):
+        if run.ended is not None or run.transfers[-1].terminated or len(run.transfers) >= self._room(run):
             return
         if self._finish(run):  # the reward stands with the order
             order, external = run.transfers[-2:]
@@ -104,7 +130,11 @@ class ClosedLoop:
     def _order(self, run: _Run) -> None:
         """Ask the policy and have its order carried out."""
         rules, seen = self.rules, self._seen(run)
-        command = rules.decode(self.policy.act(seen, run.goal, np.asarray(run.previous)))
+        action = self.policy.act(seen, run.goal, np.asarray(run.previous))
+        if bool(nobody_moves(action)):
+            self._wait(run)
+            return
+        command = rules.decode(action)
         predicted, feasible = rules.transfer(seen, run.goal, command)
         target = run.goal[:2] if command.final else command.place_mm
         chart = np.array(rules.cell.chart.from_table(command.place_mm), float)
@@ -117,6 +147,14 @@ class ClosedLoop:
             verdict = rules.judge(done.pose, run.goal, command.final, np.bool_(done.tried))
         penalty = rules.motion_penalty(command.arm, run.pose, done.pose)
         self._record(run, order, done, verdict._replace(reward=verdict.reward - penalty))
+
+    def _wait(self, run: _Run) -> None:
+        """No arm is to move, now or later: a time-out. The entry has an order to nobody, which nobody carried out."""
+        order = Order(max(int(run.previous), 0), False, np.zeros(2), run.pose[:2], run.pose, False)
+        done = Done(run.pose, Refusal.DECLINED, "the policy wants no arm to move")
+        self._record(run, order, done, Verdict(np.float64(0), np.bool_(False), np.int64(Outcome.NONE)))
+        run.transfers[-1] = replace(run.transfers[-1], truncated=True, outcome=Outcome.TIMEOUT)
+        run.ended = "stuck"
 
     def _finish(self, run: _Run) -> bool:
         """Architecture A's final transfer, if an arm can do it; whether it was ordered."""
@@ -137,7 +175,7 @@ class ClosedLoop:
     @staticmethod
     def _record(run: _Run, order: Order, done: Done, verdict: Verdict) -> None:
         reward, terminated, outcome = float(verdict.reward), bool(verdict.terminated), Outcome(int(verdict.outcome))
-        run.transfers.append(Transfer(run.attempt, order, run.pose, run.previous, done, reward, terminated, False, outcome))
+        run.transfers.append(Transfer(run.attempt, run.goal, order, run.pose, run.previous, done, reward, terminated, False, outcome))
         run.pose = done.pose
         if done.tried or moved(run.transfers[-1].before, done.pose):
             run.previous = order.arm
@@ -152,7 +190,8 @@ class ClosedLoop:
             reason = Refusal.OUT_OF_REACH if isinstance(failure, OutOfArmsReach) else Refusal.DECLINED
             return Done(pose, reason, str(failure))
         execution = self.backend.execute(order.arm, motion.paths)
-        return Done(execution.pose, execution.refusal, "", motion.planning_ms, motion.duration_s, execution.path_mm)
+        truth = self.backend.true_pose() if isinstance(self.backend, Truthful) else None
+        return Done(execution.pose, execution.refusal, "", motion.planning_ms, motion.duration_s, execution.path_mm, truth)
 
     def _plan(self, order: Order, pose: Floats, seen: Floats) -> TransferMotion:
         joints = self.backend.joints_rad()
@@ -186,7 +225,7 @@ class ClosedLoop:
         run.transfers[-1] = last
         if there and last.over:
             run.ended = "success"
-        elif last.done.refusal == Refusal.TIPPED or (run.attempt > 0 and last.repeats(run.transfers[-2])):
+        elif last.done.refusal == Refusal.TIPPED or (run.attempt > 0 and last.repeats(run.transfers[-2], *self._same)):
             run.ended = "stuck"
         elif count >= self.limit:
             run.ended = "transfers"
@@ -205,7 +244,7 @@ def make_loop(
     """A closed loop around a policy, in the policy's own cell.
 
     Transfers are priced as these arms move. On arms that are not exact, placements are judged with their tolerance, and the hand-overs
-    keep away from the edge of the shared space: ``settings.chart_inset``.
+    keep away from the edge of the shared space: ``settings.chart_inset``, or the backend's own if that is smaller.
 
     Args:
         policy: the supervisor.
@@ -223,7 +262,8 @@ def make_loop(
     planner = MotionPlanner(model, motion)
     planner.warm_up()
     made = make_backend(backend, model, policy.rules.config, motion, **options)
-    cell = model.cell if made.exact else model.cell.with_inset(min(settings.chart_inset, model.cell.config.chart_inset))
+    inset = min(settings.chart_inset, model.cell.config.chart_inset, made.chart_inset if isinstance(made, Inset) else 1.0)
+    cell = model.cell if made.exact else model.cell.with_inset(inset)
     price = motion_cost(cell, policy.rules.config, motion)
     rules = Rules(cell, policy.rules.config, price, physical=not made.exact)
     return ClosedLoop(policy.under(rules), planner, made, settings)

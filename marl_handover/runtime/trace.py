@@ -14,19 +14,19 @@ from marl_handover.task.rules import Outcome, Rules
 def trace_text(episodes: Sequence[Episode], rules: Rules) -> str:
     """All lines, episode by episode; what came after the first verdict has an ``attempt`` above 0."""
     rows = [
-        {"episode": number, "step": step, **transfer_row(transfer, episode, rules)}
+        {"episode": number, "step": step, **transfer_row(transfer, rules)}
         for number, episode in enumerate(episodes)
         for step, transfer in enumerate(episode.transfers)
     ]
     return "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows)
 
 
-def transfer_row(transfer: Transfer, episode: Episode, rules: Rules) -> dict[str, Any]:
+def transfer_row(transfer: Transfer, rules: Rules) -> dict[str, Any]:
     """One line: the fields of a kinematic trace with measured poses, and what only a motion has."""
     order, done = transfer.order, transfer.done
     return {
         "state": transfer.before.tolist(),
-        "goal": episode.goal.tolist(),
+        "goal": transfer.goal.tolist(),
         "previous_arm": ARM_LETTERS[transfer.previous_arm] if transfer.previous_arm >= 0 else None,
         "arm": ARM_LETTERS[order.arm],
         "final": order.final,

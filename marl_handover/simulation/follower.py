@@ -93,6 +93,4 @@ class ServoFollower:
 
 
 def _differ(one: ServoState, other: ServoState) -> bool:
-    return bool(
-        np.abs(one.joints_rad - other.joints_rad).max() > _STILL_RAD or np.abs(one.gripper_mm - other.gripper_mm).max() > _STILL_MM
-    )
+    return bool(np.abs(one.joints_rad - other.joints_rad).max() > _STILL_RAD or np.abs(one.gripper_mm - other.gripper_mm).max() > _STILL_MM)

@@ -27,7 +27,7 @@ def transfer(pose, predicted=GOAL, *, attempt=0, arm=0, final=True, refusal=None
     done = Done(np.array(pose, float), refusal, "", planning_ms, 4.0, 200.0)
     order = Order(arm, final, np.zeros(2), predicted[:2], np.array(predicted, float), True)
     over = outcome != Outcome.NONE
-    return Transfer(attempt, order, np.zeros(3), -1, done, -1.0, over, False, outcome)
+    return Transfer(attempt, GOAL, order, np.zeros(3), -1, done, -1.0, over, False, outcome)
 
 
 def episode(*transfers, ended="success"):

@@ -380,3 +380,13 @@ def test_transfers_are_priced_as_these_arms_move(planner, tmp_path, monkeypatch)
 def test_unknown_backends_are_named():
     with pytest.raises(UnknownChoice, match="kinematic, noisy, bullet"):
         make_loop(policies.load("exact"), "gazebo")
+
+
+def test_a_policy_that_wants_nobody_to_move_has_timed_out_and_is_not_asked_again(planner):
+    rules = policies.load("exact").rules
+    start, goal = (poses[0] for poses in random_problems(rules, 1, 5))
+    policy = Scripted(rules, [[math.nan] * 4])
+    episode = ClosedLoop(policy, planner, NoisyBackend(planner.model, MOTION, noise=EXACT, missed_grasps=0.0)).play(start, goal)
+    assert (episode.outcome, episode.ended, len(episode.transfers), len(policy.seen)) == (Outcome.TIMEOUT, "stuck", 1, 1)
+    assert np.isfinite(episode.transfers[0].order.place_mm).all()
+    assert episode.transfers[0].done.pose.tolist() == start.tolist()

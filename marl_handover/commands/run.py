@@ -1,0 +1,129 @@
+"""``marl-handover run``: the closed loop on hardware or on its twin."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover import policies
+from marl_handover.commands.person import confirmed
+from marl_handover.config import CellConfig, LoopConfig, MotionConfig, TaskChanges, require_at_least, require_seed
+from marl_handover.errors import InvalidSetting, MissingFile, OutOfReach
+from marl_handover.runtime.settings import LabConfig
+
+if TYPE_CHECKING:
+    from marl_handover.runtime.episode import Episode
+    from marl_handover.runtime.loop import ClosedLoop
+    from marl_handover.runtime.session import Session
+    from marl_handover.task.rules import Rules
+
+Floats = NDArray[np.float64]
+
+
+@dataclass
+class RunCommand(LabConfig):
+    """Settings of ``run``."""
+
+    policy: str = "pretrained_b"  # exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
+    episodes: int = 1
+    seed: int = 0  # of the twin's problems
+    start: list[float] | None = None  # of the twin's block: x [mm], y [mm], orientation [deg]; null: random
+    goal: list[float] | None = None  # the same; null: of the twin random, of a real cell the printed marker
+    printed: bool = False  # of the twin: the goal is a printed marker that the camera has to see
+    dry_run: bool = False  # everything but the last write: nothing moves
+    log: str = ""  # file for every event, JSON Lines
+    cell: CellConfig | None = None  # single keys change the paper cell
+    task: TaskChanges = field(default_factory=TaskChanges)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    loop: LoopConfig = field(default_factory=LoopConfig)
+
+
+SCHEMA: type = RunCommand
+ALIASES = {key: f"task.{key}" for key in ("epsilon_deg", "architecture", "max_steps")}
+GROUPS: dict[str, dict[str, type]] = {}
+
+
+def run(config: RunCommand) -> int:
+    """Play and print. 0 if every episode ended at its goal, else 1."""
+    from marl_handover.runtime.loop import make_loop
+    from marl_handover.runtime.session import Session
+
+    _check(config)
+    policy = policies.adapted(config.policy, config.cell, config.seed, motion=config.motion, **vars(config.task))
+    options: dict[str, Any] = {"config": config, "confirm": confirmed, "dry_run": config.dry_run, "log_path": config.log}
+    with make_loop(policy, "hardware", config.motion, config.loop, **options) as loop:
+        session = Session(loop, {"policy": config.policy, "hardware": config.hardware.name, "seed": config.seed, "dry_run": config.dry_run})
+        solved = 0
+        for number, (start, goal) in enumerate(_problems(config, loop.rules)):
+            begun = time.perf_counter()
+            episode = _play(config, session, loop, start, goal, config.seed + number)
+            solved += episode.solved
+            _tell(number, episode, time.perf_counter() - begun)
+        faults = {str(event): count for event, count in sorted(session.log.counts.items()) if event in _faults()}
+    where = "would be at the goal (dry run: nothing moved)" if config.dry_run else "at the goal"
+    print(f"{solved} of {config.episodes} {where}; what went wrong: {', '.join(f'{n} {c}' for n, c in faults.items()) or 'nothing'}")
+    return 0 if solved == config.episodes else 1
+
+
+def _check(config: RunCommand) -> None:
+    require_at_least("episodes", config.episodes, 1)
+    require_seed(config.seed)
+    for name in ("start", "goal"):
+        value = getattr(config, name)
+        if value is not None and (len(value) != 3 or not np.isfinite(value).all()):
+            raise InvalidSetting(name, value, "x [mm], y [mm], orientation [deg]")
+    if config.start is not None and not config.emulated:
+        raise InvalidSetting("start", config.start, "left out with a real cell: its block lies where it lies")
+    if config.log and not Path(config.log).parent.is_dir():
+        raise MissingFile("folder", Path(config.log).parent, "make it first")
+
+
+def _problems(config: RunCommand, rules: Rules) -> Iterator[tuple[Floats, Floats | None]]:
+    """Starts and goals (3,); None: the goal is printed."""
+    from marl_handover.learning.evaluation import random_problems
+
+    drawn = random_problems(rules, config.episodes, config.seed)
+    for start, goal in zip(*drawn, strict=True):
+        given = [_pose(name, value, rules) for name, value in (("start", config.start), ("goal", config.goal))]
+        goal_now = goal if given[1] is None else given[1]
+        yield start if given[0] is None else given[0], goal_now if config.emulated or given[1] is not None else None
+
+
+def _pose(name: str, value: list[float] | None, rules: Rules) -> Floats | None:
+    if value is None:
+        return None
+    pose = np.array([value[0], value[1], np.radians(value[2])])
+    if not rules.cell.reaches(pose[:2]).any():
+        raise OutOfReach(name, (pose[0], pose[1]), rules.cell.r_min_mm, rules.cell.r_max_mm)
+    return pose
+
+
+def _play(config: RunCommand, session: Session, loop: ClosedLoop, start: Floats, goal: Floats | None, seed: int) -> Episode:
+    from marl_handover.runtime.session import GivenGoal, PrintedGoal
+
+    twin = session.backend.lab.twin
+    if goal is not None and not (config.printed and twin is not None):
+        return session.play(start, GivenGoal(goal), seed)
+    if twin is not None:
+        twin.goal = goal
+    return session.play(start, PrintedGoal(session.backend), seed)
+
+
+def _tell(number: int, episode: Episode, wall_s: float) -> None:
+    from marl_handover.runtime.session import transfer_line
+
+    print(f"episode {number}: {episode.ended} after {len(episode.transfers)} transfers, {wall_s:.1f} s", flush=True)
+    for transfer in episode.transfers:
+        print(transfer_line(transfer))
+
+
+def _faults() -> frozenset[Any]:
+    from marl_handover.runtime.events import FAULTS
+
+    return FAULTS

@@ -1,0 +1,136 @@
+"""What happens in a session, by name, and the log it is kept in: JSON Lines, each written out at once.
+
+Every line has ``t_s`` (the session's clock), ``event`` (a value of :class:`Event`) and that event's own fields, which docs/hardware.md
+lists. Lengths are in mm, angles in rad. A trace can be drawn from the log alone: ``state`` lines carry the joints of all arms while one
+moves, ``seen`` lines the block and the goal.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from marl_handover.errors import InvalidSetting
+
+
+class Event(StrEnum):
+    """What a line of the log is about. Comments: the reaction."""
+
+    SESSION = "session"
+    EPISODE = "episode"
+    GOAL = "goal"
+    SEEN = "seen"
+    STATE = "state"
+    MOTION = "motion"
+    TRANSFER = "transfer"
+    ENDED = "ended"
+    ARMED = "armed"
+    # What goes wrong.
+    FAILED_GRASP = "failed_grasp"  # look again, decide again
+    DROPPED = "dropped"  # the same, from where the block lies now
+    BLOCK_MOVED = "block_moved"  # somebody moved it: decide from where it is
+    GOAL_CHANGED = "goal_changed"  # a transfer that is going on is finished; then decide for the new goal
+    BLOCK_OUTSIDE = "block_outside"  # no arm reaches it: wait, for as long as there is patience, until somebody puts it back
+    MARKER_HIDDEN = "marker_hidden"  # arms hold; wait until it is seen again
+    CAMERA_FROZEN = "camera_frozen"  # arms hold; wait for new pictures
+    SERIAL_LOST = "serial_lost"  # reconnect, read back where the arms are held, go on with the motion
+    CONTROLLER_RESET = "controller_reset"  # nothing moves until somebody has put the arms into the parked pose; then arm, look, decide
+    BAD_REPLY = "bad_reply"  # arms hold; the motion goes on from there
+    HOST_LATE = "host_late"  # the same
+    GATE_REFUSED = "gate_refused"  # the command is not sent; the arm goes home, or stays for somebody to help
+    ARM_STALLED = "arm_stalled"  # one arm does nothing, time and again: the episode ends
+    STOPPED = "stopped"  # the latched stop: every channel is stopped, the session ends
+    RECOVERED = "recovered"  # what was wrong is over
+
+
+NOTES = frozenset(
+    (
+        Event.SESSION,
+        Event.EPISODE,
+        Event.GOAL,
+        Event.SEEN,
+        Event.STATE,
+        Event.MOTION,
+        Event.TRANSFER,
+        Event.ENDED,
+        Event.ARMED,
+        Event.RECOVERED,
+    )
+)
+"""The events of every good session."""
+
+FAULTS = frozenset(Event) - NOTES
+"""The events that tell of something wrong or unforeseen."""
+
+
+class EventLog:
+    """Writes events to a file as they come, and counts them.
+
+    Args:
+        clock: gives ``t_s``.
+        path: of the file; empty: only counted.
+        listener: is shown each line as well.
+
+    Raises:
+        InvalidSetting: if the file cannot be written.
+    """
+
+    def __init__(self, clock: Callable[[], float], path: str = "", listener: Callable[[dict[str, Any]], None] | None = None) -> None:
+        self._clock, self._listener = clock, listener
+        self.counts: Counter[Event] = Counter()
+        try:
+            self._file = Path(path).open("w", encoding="utf-8") if path else None  # noqa: SIM115 - closed by close()
+        except OSError as error:
+            raise InvalidSetting("log", path, f"a file that can be written ({error.strerror or error})") from error
+
+    @property
+    def verbose(self) -> bool:
+        """Whether anybody reads more than the counts."""
+        return self._file is not None or self._listener is not None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def add(self, event: Event, **fields: Any) -> None:
+        """Note ``event``; fields are numbers, texts, None, arrays, or lists and mappings of them."""
+        self.counts[event] += 1
+        if not self.verbose:
+            return
+        row = {"t_s": round(self._clock(), 4), "event": str(event), **{name: _plain(value) for name, value in fields.items()}}
+        if self._file is not None:
+            self._file.write(json.dumps(row, allow_nan=False) + "\n")
+            self._file.flush()
+        if self._listener is not None:
+            self._listener(row)
+
+    def close(self) -> None:
+        """Close the file; again is fine."""
+        if self._file is not None:
+            self._file.close()
+
+
+def _plain(value: Any) -> Any:
+    """``value`` as JSON has it, numbers to 0.1 um and 6e-6 degrees; what is not finite is null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, float | np.floating):
+        return round(float(value), 7) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value if value is None or isinstance(value, int) else str(value)

@@ -1,0 +1,270 @@
+"""Transfers carried out by servo arms and seen by a camera, real ones or the twin's: a backend of the closed loop.
+
+Whatever goes wrong becomes an :class:`~marl_handover.runtime.events.Event` and has its reaction here; the loop only sees where the block
+lies then. Nothing waits without a limit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover.arrays import wrap
+from marl_handover.cell.build import CellModel
+from marl_handover.config import MotionConfig
+from marl_handover.envs.backends import Execution
+from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
+from marl_handover.errors import WorkFailed
+from marl_handover.hardware.errors import Stopped
+from marl_handover.hardware.settings import HardwareConfig
+from marl_handover.motion.cycle import timed_phases
+from marl_handover.motion.trajectory import CyclePaths, Phase
+from marl_handover.perception.calibration import Pixels
+from marl_handover.runtime.events import Event
+from marl_handover.runtime.lab import open_lab
+from marl_handover.runtime.mover import Mover
+from marl_handover.runtime.reach import drawn_in
+from marl_handover.runtime.settings import TWIN, LabConfig, twin_lab
+from marl_handover.task.rules import carried
+
+Floats = NDArray[np.float64]
+
+FRESH_S = 0.5
+"""A look that is no older than this need not be taken again."""
+
+_EDGE_MM = 1.0
+
+
+class BlockNotSeen(WorkFailed):
+    """The block does not show itself, or the camera gives no pictures."""
+
+    def __init__(self, camera_works: bool, patience_s: float) -> None:
+        what = "the block was not seen lying still" if camera_works else "the camera gave no new picture"
+        super().__init__(f"{what} for {patience_s:g} s; is it on the table, its marker up, nothing over it, in the camera's picture?")
+        self.camera_works = camera_works
+
+
+class _Sighted(NamedTuple):
+    pose: Floats
+    t_s: float
+
+
+class HardwareBackend:
+    """Arms, camera and block of one cell. See :class:`~marl_handover.envs.backends.Backend`.
+
+    Args:
+        model: the cell.
+        motion: degree, limits and times of the motions, the parked pose.
+        config: electronics, camera, calibration.
+        confirm: is asked before first moves of a real cell; see :class:`~marl_handover.hardware.driver.ArmDriver`.
+        dry_run: do all but the last write. Nothing moves, and the block is taken to be where exact arms would have put it.
+        log_path: of the session's log; empty: there is none.
+
+    Raises:
+        MissingFile, CorruptFile, CalibrationProblem: it was not calibrated.
+        NoCamera: the camera is not there.
+    """
+
+    exact = False
+
+    def __init__(
+        self,
+        model: CellModel,
+        motion: MotionConfig,
+        *,
+        config: LabConfig,
+        confirm: Callable[[str], bool] | None = None,
+        dry_run: bool = False,
+        log_path: str = "",
+    ) -> None:
+        self.lab = lab = open_lab(config, model, motion, confirm=confirm, dry_run=dry_run, log_path=log_path)
+        self.model, self.motion, self.log = model, motion, lab.log
+        self.config, self.clock = lab.config.watch, lab.clock
+        self.chart_inset = config.chart_inset
+        self.same = (self.config.moved_mm, math.radians(self.config.moved_deg))
+        self.check = CycleCheck(model, motion)
+        self.mover = Mover(lab)
+        self._last = _Sighted(np.zeros(3), -math.inf)
+        self._idle = [0] * model.cell.num_arms
+
+    def reset(self, pose: Floats, seed: int) -> Floats:
+        """Arm if that is due and look; its measured pose (3,). On the twin somebody puts the block at ``pose`` first.
+
+        Raises:
+            BlockNotSeen: it does not show itself.
+            DeviceError: the electronics cannot be brought up.
+        """
+        self.mover.ready()
+        if self.lab.twin is not None:
+            self.lab.twin.nudge(pose)
+        self._idle = [0] * self.model.cell.num_arms
+        self._last = _Sighted(np.zeros(3), -math.inf)
+        self.lab.watcher.forget()
+        return self._look()
+
+    def joints_rad(self) -> Floats:
+        """Where the arms were sent: (num_arms, 5). Servos say nothing."""
+        return self.mover.joints_rad()
+
+    def goal(self) -> Floats | None:
+        """Where the printed goal lies (3,), as it was seen last; None if it never was."""
+        return self.lab.watcher.last_goal
+
+    def true_pose(self) -> Floats:
+        """Of the twin: where the block truly is (3,). Of a real cell: where it was seen last."""
+        return self._last.pose.copy() if self.lab.twin is None else self.lab.twin.true_pose()
+
+    def watch(self) -> Floats:
+        """Where the block lies (3,). One that no arm reaches is waited for, as long as there is patience."""
+        before, last_s = self._last
+        if self.lab.driver.dry_run:
+            return before.copy()
+        if self.clock.now_s() - last_s > FRESH_S:
+            self._look()
+            if self._apart(before, self._last.pose):
+                self.log.add(Event.BLOCK_MOVED, was=before, pose=self._last.pose)
+        if not self._reached():
+            self._wait_for_reach()
+        return self._last.pose.copy()
+
+    def execute(self, arm: int, paths: CyclePaths) -> Execution:
+        """Time one cycle of ``arm``, play it, park, look; the other arm holds still.
+
+        Raises:
+            Stopped: the stop is latched.
+            DeviceError, BlockNotSeen: what is wrong did not pass within the settings' patience.
+        """
+        before = self._last.pose
+        refusal = self.check(arm, paths, self.joints_rad()[arm], before[:2])
+        if refusal is not None:
+            return Execution(before.copy(), self.joints_rad(), 0.0, refusal)
+        phases = timed_phases(welded(paths), self.model.arm, self.motion, self.model.cell.config.pick_height_mm)
+        place = self.check.grip_mm(arm, paths.transfer[-1])[:2]
+        self.log.add(Event.MOTION, arm=arm, phases=[[phase.name, float(phase.t_s[0]), float(phase.t_s[-1])] for phase in phases])
+        try:
+            played = self.mover.play(arm, phases, None if self.lab.driver.dry_run else self._block_watch(before))
+        except Stopped as stop:
+            self.log.add(Event.STOPPED, reason=stop.reason)
+            raise
+        path_mm = self._length_mm(arm, phases)
+        if self.lab.driver.dry_run:
+            moved = carried(before, place, paths.transfer[-1, 0] - paths.transfer[0, 0])
+            self._last = _Sighted(np.asarray(moved, float), self.clock.now_s())
+            return Execution(self._last.pose.copy(), self.joints_rad(), path_mm, None)
+        try:
+            pose = self._look()
+        except BlockNotSeen as lost:
+            if not lost.camera_works:
+                raise
+            return Execution(before.copy(), self.joints_rad(), path_mm, Refusal.TIPPED)
+        failure = self._failure(arm, before, pose, place) if played else self._unplayed(before, pose, phases)
+        return Execution(pose, self.joints_rad(), path_mm, failure)
+
+    def render(self) -> Pixels:
+        """The camera's picture, RGB (height, width, 3)."""
+        return np.ascontiguousarray(self.lab.camera.read().image[..., ::-1])
+
+    def halt(self) -> None:
+        """Stop every channel where it is."""
+        self.lab.driver.halt()
+
+    def close(self) -> None:
+        """Park if the settings say so, and let everything go."""
+        self.lab.close()
+
+    def _block_watch(self, before: Floats) -> Callable[[float], bool]:
+        """Says, once in a while during an approach, whether the block is no longer where it was."""
+        next_s = self.config.glance_s
+
+        def moved(t_s: float) -> bool:
+            nonlocal next_s
+            if t_s < next_s:
+                return False
+            next_s = t_s + self.config.glance_s
+            now = self.lab.watcher.glance()
+            if now is None or not self._apart(before, now):
+                return False
+            self.log.add(Event.BLOCK_MOVED, was=before, pose=now)
+            return True
+
+        return moved
+
+    def _look(self) -> Floats:
+        """Look until the block lies still."""
+        view = self.lab.watcher.look()
+        if view.block is None:
+            raise BlockNotSeen(view.camera_works, self.config.patience_s)
+        self._last = _Sighted(view.block, self.clock.now_s())
+        self.log.add(Event.SEEN, pose=view.block, goal=view.goal)
+        return view.block.copy()
+
+    def _failure(self, arm: int, before: Floats, after: Floats, place_mm: Floats) -> Refusal | None:
+        """What came of a motion that was played to its end."""
+        if not self._apart(before, after) and math.dist(before[:2], place_mm) > self.config.moved_mm:
+            self._idle[arm] += 1
+            self.log.add(Event.FAILED_GRASP, arm=arm, pose=after)
+            if self._idle[arm] >= self.config.failures:
+                self.log.add(Event.ARM_STALLED, arm=arm)
+                return Refusal.DECLINED
+            return Refusal.MISSED_GRASP
+        self._idle[arm] = 0
+        if math.dist(after[:2], place_mm) > self.config.missed_mm:
+            self.log.add(Event.DROPPED, arm=arm, pose=after, place=place_mm)
+            return Refusal.DROPPED
+        return None
+
+    def _unplayed(self, before: Floats, after: Floats, phases: Sequence[Phase]) -> Refusal:
+        """What came of a motion that was broken off: before the hand had closed, the block was not in it."""
+        closed_s = next(float(phase.t_s[-1]) for phase in phases if phase.name == "grasp")
+        return Refusal.DROPPED if self.mover.reached_s > closed_s and self._apart(before, after) else Refusal.MISSED_GRASP
+
+    def _apart(self, one: Floats, other: Floats) -> bool:
+        turned_deg = abs(math.degrees(float(wrap(one[2] - other[2]))))
+        return math.dist(one[:2], other[:2]) > self.config.moved_mm or turned_deg > self.config.moved_deg
+
+    def _reached(self) -> bool:
+        return bool(self.model.cell.reaches(drawn_in(self.model.cell, self._last.pose, _EDGE_MM)[:2]).any())
+
+    def _wait_for_reach(self) -> None:
+        """Somebody has to put the block back."""
+        self.log.add(Event.BLOCK_OUTSIDE, pose=self._last.pose)
+        end_s = self.clock.now_s() + self.config.patience_s
+        while not self._reached() and self.clock.now_s() < end_s:
+            self.clock.sleep_s(10 * self.config.frame_s)
+            self._look()
+        if self._reached():
+            self.log.add(Event.RECOVERED, what=Event.BLOCK_OUTSIDE)
+
+    def _length_mm(self, arm: int, phases: Sequence[Phase]) -> float:
+        """Of the grip's path while it holds the block."""
+        carrying = [phase.joints_rad for phase in phases if phase.name in ("lift", "transfer", "lower")]
+        steps = np.diff(self.check.grip_mm(arm, np.concatenate(carrying)), axis=0)
+        return float(np.sqrt((steps**2).sum(-1)).sum())
+
+
+class TwinBackend(HardwareBackend):
+    """The twin, calibrated.
+
+    Args:
+        model: the cell.
+        motion: how the arms move.
+        calibration: folder of what ``calibrate`` wrote; None: the usual one.
+        hardware: its electronics; None: as they are shipped.
+
+    Raises:
+        MissingFile: it was not calibrated.
+    """
+
+    def __init__(
+        self, model: CellModel, motion: MotionConfig, *, calibration: str | None = None, hardware: HardwareConfig | None = None
+    ) -> None:
+        config = twin_lab()
+        if hardware is not None:
+            config.hardware = replace(hardware, name=TWIN)
+        config.calibration = calibration or ""
+        super().__init__(model, motion, config=config)

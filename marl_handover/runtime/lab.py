@@ -1,0 +1,137 @@
+"""A cell with everything that has a plug, real or the twin: driver, camera, what is known of both, clock, log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from marl_handover.cell.build import CellModel
+from marl_handover.config import MotionConfig
+from marl_handover.errors import MissingFile
+from marl_handover.hardware.calibration import calibrations
+from marl_handover.hardware.clock import Clock, RealClock
+from marl_handover.hardware.driver import ArmDriver
+from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.settings import ARMS, HardwareConfig
+from marl_handover.perception.calibration import CameraCalibration
+from marl_handover.perception.camera import Camera
+from marl_handover.perception.detector import Detector
+from marl_handover.perception.sources import open_camera
+from marl_handover.perception.tracker import Tracker
+from marl_handover.runtime.events import EventLog
+from marl_handover.runtime.play import Play, half_bands_rad, load_play
+from marl_handover.runtime.settings import LabConfig
+from marl_handover.runtime.twin import Twin
+from marl_handover.runtime.watcher import Watcher
+
+CAMERA_FILE = "camera.json"
+
+
+@dataclass
+class Plugs:
+    """What a cell is reached through. ``twin`` is None for a real one."""
+
+    hardware: HardwareConfig
+    camera: Camera
+    clock: Clock
+    confirm: Callable[[str], bool] | None
+    twin: Twin | None = None
+
+    def close(self) -> None:
+        """Let camera and twin go."""
+        self.camera.close()
+        if self.twin is not None:
+            self.twin.close()
+
+
+@dataclass
+class Lab:
+    """A cell that is ready to be connected."""
+
+    config: LabConfig
+    driver: ArmDriver
+    camera: Camera
+    watcher: Watcher
+    play: Play
+    clock: Clock
+    log: EventLog
+    twin: Twin | None
+
+    def close(self) -> None:
+        """Let go of arms, as the settings say, of camera and log."""
+        try:
+            self.driver.disconnect()
+        finally:
+            self.camera.close()
+            self.log.close()
+            if self.twin is not None:
+                self.twin.close()
+
+
+def plug_in(config: LabConfig, model: CellModel, motion: MotionConfig, confirm: Callable[[str], bool] | None = None) -> Plugs:
+    """The twin, if ``config`` is one; else the camera that is there, and ``confirm`` is asked before first moves.
+
+    Raises:
+        InvalidSetting, UnknownChoice: a setting is out of its limits.
+        NoCamera: the camera is not there.
+    """
+    config.validate()
+    if config.emulated:
+        twin = Twin(model, motion, config)
+        return Plugs(twin.hardware, twin.camera, twin.clock, twin.confirm, twin)
+    clock = RealClock()
+    return Plugs(config.hardware, open_camera(config.camera, clock=clock.now_s), clock, confirm)
+
+
+def open_lab(
+    config: LabConfig,
+    model: CellModel,
+    motion: MotionConfig,
+    *,
+    confirm: Callable[[str], bool] | None = None,
+    dry_run: bool = False,
+    log_path: str = "",
+) -> Lab:
+    """A calibrated cell.
+
+    Raises:
+        MissingFile, CorruptFile, CalibrationProblem, CalibrationMismatch: ``calibrate`` has to be run first, or again.
+        NoCamera: the camera is not there.
+        InvalidSetting, UnknownChoice: a setting is out of its limits.
+    """
+    folder = config.folder()
+    seen_by = camera_calibration(folder)
+    half_us = load_play(folder)
+    plugs = plug_in(config, model, motion, confirm)
+    try:
+        hardware = calibrated(plugs.hardware, folder)
+        play = Play(half_bands_rad(half_us, calibrations(hardware, model.arm)), model.arm.lower_rad, model.arm.upper_rad)
+        driver = ArmDriver(
+            hardware, model, motion, clock=plugs.clock, latch=StopLatch(hardware.stop_path()), confirm=plugs.confirm, dry_run=dry_run
+        )
+        log = EventLog(plugs.clock.now_s, log_path)
+        tracker = Tracker(Detector(seen_by, model.cell.config.block, config.target, config.detector), config.tracker)
+        watcher = Watcher(plugs.camera, tracker, plugs.clock, config.watch, log)
+    except BaseException:
+        plugs.close()
+        raise
+    return Lab(config, driver, plugs.camera, watcher, play, plugs.clock, log, plugs.twin)
+
+
+def camera_calibration(folder: Path) -> CameraCalibration:
+    """The camera's, from the folder of calibrations. Raises :class:`MissingFile` or :class:`CorruptFile`."""
+    path = folder / CAMERA_FILE
+    if not path.is_file():
+        raise MissingFile("camera calibration", path, "run: marl-handover calibrate what=camera")
+    return CameraCalibration.load(path)
+
+
+def calibrated(hardware: HardwareConfig, folder: Path) -> HardwareConfig:
+    """The electronics with the arms' calibration files in ``folder``; a file that the settings name stays."""
+    arms = {
+        name: wiring if wiring.calibration else replace(wiring, calibration=str(folder / f"{name}.json"))
+        for name, wiring in hardware.arms.items()
+        if name in ARMS
+    }
+    return replace(hardware, arms=arms)

@@ -1,0 +1,125 @@
+"""A session of the closed loop on a cell: episodes, their goals, and the log of it all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_handover.cell.symmetry import ARM_LETTERS
+from marl_handover.errors import WorkFailed
+from marl_handover.runtime.episode import Episode, Transfer
+from marl_handover.runtime.events import Event, EventLog
+from marl_handover.runtime.hardware_backend import HardwareBackend
+from marl_handover.runtime.loop import ClosedLoop
+from marl_handover.runtime.trace import transfer_row
+
+Floats = NDArray[np.float64]
+Goals = Callable[[], Floats]
+
+
+class NoGoal(WorkFailed):
+    """The printed goal was not seen."""
+
+    def __init__(self) -> None:
+        super().__init__("no goal: lay the printed goal marker where the camera sees it, or give goal=[x,y,deg]")
+
+
+class GivenGoal:
+    """A goal that stays until somebody sets another, from any thread."""
+
+    def __init__(self, goal: ArrayLike) -> None:
+        self._goal = np.asarray(goal, float)
+
+    def set(self, goal: ArrayLike) -> None:
+        """From the next decision on, the block is to go to ``goal`` (3,)."""
+        self._goal = np.asarray(goal, float)
+
+    def __call__(self) -> Floats:
+        """The goal (3,)."""
+        return self._goal.copy()
+
+
+class PrintedGoal:
+    """The goal is wherever the printed marker was seen last; one that is covered stays where it was.
+
+    Sightings within ``same_mm`` and ``same_rad`` are of a marker that has not moved.
+    """
+
+    def __init__(self, backend: HardwareBackend, same_mm: float = 3.0, same_rad: float = 0.05) -> None:
+        self._backend, self._same_mm, self._same_rad = backend, same_mm, same_rad
+        self._goal: Floats | None = None
+
+    def __call__(self) -> Floats:
+        """The goal (3,). Raises :class:`NoGoal` if it was never seen."""
+        seen = self._backend.goal()
+        if seen is None and self._goal is None:
+            raise NoGoal()
+        if seen is not None and (self._goal is None or self._differs(seen, self._goal)):
+            self._goal = seen.copy()
+        assert self._goal is not None
+        return self._goal.copy()
+
+    def _differs(self, one: Floats, other: Floats) -> bool:
+        turned = abs(float(np.angle(np.exp(1j * (one[2] - other[2])))))
+        return float(np.hypot(*(one[:2] - other[:2]))) > self._same_mm or turned > self._same_rad
+
+
+class Session:
+    """Plays episodes and writes down what happens.
+
+    Args:
+        loop: around a :class:`HardwareBackend`.
+        about: goes into the log's first line.
+    """
+
+    def __init__(self, loop: ClosedLoop, about: dict[str, Any]) -> None:
+        if not isinstance(loop.backend, HardwareBackend):
+            raise TypeError("a session needs arms and a camera, real or the twin's")
+        self.loop, self.backend = loop, loop.backend
+        self.log: EventLog = self.backend.log
+        rules = loop.rules
+        parked = self.backend.check.parked_rad
+        self.log.add(
+            Event.SESSION,
+            **about,
+            cell=asdict(rules.cell.config),
+            epsilon_rad=rules.epsilon_rad,
+            position_tolerance_mm=rules.config.position_tolerance_mm,
+            parked_rad=parked,
+        )
+
+    def play(self, start: ArrayLike, goals: Goals, seed: int = 0) -> Episode:
+        """One episode; ``start`` (3,) is where somebody puts the twin's block; a real one lies where it lies.
+
+        Raises as the backend's ``reset`` and ``execute``, and :class:`NoGoal`.
+        """
+        asked: list[Floats] = []
+
+        def current() -> Floats:
+            goal = goals()
+            if not asked or np.abs(goal - asked[-1]).max() > 0:
+                self.log.add(Event.GOAL_CHANGED if asked else Event.GOAL, goal=goal)
+                asked.append(goal)
+            return goal
+
+        self.log.add(Event.EPISODE, seed=seed)
+        # A printed goal shows itself at the first look, which play() takes before it asks.
+        episode = self.loop.play(np.asarray(start, float), np.full(3, np.inf), seed, self._note, current)
+        outcome = episode.outcome.name.lower()
+        self.log.add(Event.ENDED, ended=episode.ended, outcome=outcome, transfers=len(episode.transfers), goal=episode.goal)
+        return episode
+
+    def _note(self, transfer: Transfer) -> None:
+        self.log.add(Event.TRANSFER, **transfer_row(transfer, self.loop.rules))
+
+
+def transfer_line(transfer: Transfer) -> str:
+    """A transfer for people."""
+    order, done = transfer.order, transfer.done
+    where = "the goal" if order.final else f"({order.place_mm[0]:.0f}, {order.place_mm[1]:.0f})"
+    came = done.refusal or f"({done.pose[0]:.1f}, {done.pose[1]:.1f}) mm, {np.degrees(done.pose[2]):.1f} deg"
+    return f"  {ARM_LETTERS[order.arm]} to {where}: {came}"

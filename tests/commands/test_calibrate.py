@@ -1,0 +1,82 @@
+"""``marl-handover calibrate`` on the twin: what it finds is near the truth, without ever having been told."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from marl_handover.cell import build_cell, cell_config
+from marl_handover.cli import main
+from marl_handover.commands.person import Person, confirmed
+from marl_handover.config import MotionConfig
+from marl_handover.errors import WorkFailed
+from marl_handover.hardware.calibration import load_calibration, nominal_calibration
+from marl_handover.hardware.emulator.cell import EmulatedCell
+from marl_handover.hardware.settings import ARMS
+from marl_handover.perception.calibration import CameraCalibration, hung_camera
+from marl_handover.runtime.play import load_play
+from marl_handover.runtime.settings import CardConfig, twin_lab
+
+
+@pytest.fixture(scope="module")
+def model():
+    return build_cell(cell_config("paper"))
+
+
+def test_the_camera_maps_the_table_to_a_millimetre(twin_calibration):
+    config = twin_lab()
+    truth = hung_camera(config.mount, (config.camera.width_px, config.camera.height_px))
+    found = CameraCalibration.load(twin_calibration / "camera.json")
+    points = np.array([[x, y, 15.0] for x in (-150, 0, 150) for y in (-250, 0, 250)], float)
+    assert np.abs(found.on_plane(truth.project(points), 15.0) - points[:, :2]).max() < 1.5
+
+
+def test_servos_come_out_far_nearer_than_nominal_ones(twin_calibration, model):
+    config = twin_lab().hardware
+    truths = EmulatedCell(config, model.arm, np.radians(MotionConfig().parked_deg)).truths
+    q = np.stack([model.arm.ik(np.array([radius, side, 45.0]))[0] for radius in (165, 190, 215) for side in (-60.0, 60.0)])
+    for name in ARMS:
+        found = load_calibration(twin_calibration / f"{name}.json", name, model.arm)
+        errors = []
+        for calibration in (found, nominal_calibration(config, name, model.arm)):
+            pulses = calibration.to_us(q)
+            real = np.stack([(pulses[:, n] - t.zero_us) / t.slope_us for n, t in enumerate(truths[name][:5])], axis=1)
+            errors.append(np.linalg.norm((model.arm.fk(real) - model.arm.fk(q))[:, :2, 3], axis=1).max())
+        assert errors[0] < 4.0 < errors[1], "mm at the grip"
+        assert 2 * load_play(twin_calibration)[name] == pytest.approx(config.emulator.dead_band_us, abs=2.0)
+
+
+def test_servos_need_the_camera_first(tmp_path, capsys):
+    assert main(["calibrate", "hardware=twin", f"calibration={tmp_path}", "what=servos"]) == 2
+    assert "what=camera" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wrong", ["what=arms", "postures=3", "views=2", "camera.width_px=12"])
+def test_bad_input_is_one_line(tmp_path, capsys, wrong):
+    assert main(["calibrate", "hardware=lynxmotion", f"calibration={tmp_path}", wrong]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert wrong.split("=")[0].split(".")[-1] in error
+
+
+def test_sheets_are_written_for_everything_that_has_to_be_printed(tmp_path, capsys):
+    assert main(["calibrate", "what=sheets", f"calibration={tmp_path}"]) == 0
+    named = set(capsys.readouterr().out.split())
+    assert named == {str(path) for path in (tmp_path / "sheets").iterdir()}
+    assert {"board.pdf", "block.pdf", "goal.pdf", "hands.pdf"} <= {path.name for path in (tmp_path / "sheets").iterdir()}
+
+
+def test_files_are_json_and_say_whose_they_are(twin_calibration):
+    for name in ARMS:
+        content = json.loads((twin_calibration / f"{name}.json").read_text())
+        assert content["arm"] == name
+        assert content["measured_unix_s"] > 0
+
+
+def test_without_a_terminal_nobody_is_there(monkeypatch):
+    monkeypatch.setattr("sys.stdin", open("/dev/null"))  # noqa: SIM115 - closed with the process
+    assert not confirmed("Is the way free?")
+    with pytest.raises(WorkFailed, match="terminal"):
+        Person(CardConfig()).glue_cards()

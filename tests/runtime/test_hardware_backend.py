@@ -1,0 +1,271 @@
+"""The closed loop on the calibrated twin, bytes and pixels and all; and every event with its reaction."""
+
+from __future__ import annotations
+
+import json
+import math
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from marl_handover import policies
+from marl_handover.arrays import wrap
+from marl_handover.config import MotionConfig
+from marl_handover.envs.backends import make_backend
+from marl_handover.errors import MissingFile
+from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware.errors import DeviceError, Stopped
+from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.settings import ARMS
+from marl_handover.runtime.evaluation import truly_solved
+from marl_handover.runtime.events import FAULTS, Event
+from marl_handover.runtime.loop import make_loop
+from marl_handover.runtime.mishaps import Mishaps
+from marl_handover.runtime.session import GivenGoal, PrintedGoal, Session
+from marl_handover.runtime.settings import WatchConfig, twin_lab
+
+START, PLACE_MM = np.array([-60.0, 20.0, 0.7]), np.array([50.0, 25.0])
+"""A problem that the left arm solves in one transfer."""
+
+
+def one_transfer(cell, start=START, place_mm=PLACE_MM, arm=0):
+    turn = cell.polar(np.asarray(place_mm))[1][arm] - cell.polar(start[:2])[1][arm]
+    return np.array([*place_mm, float(wrap(start[2] + turn))])
+
+
+def lab_config(folder, stop, **hardware):
+    config = twin_lab()
+    config.calibration, config.watch = str(folder), WatchConfig(patience_s=4.0)
+    config.hardware.stop_file = str(stop)
+    config.hardware.timeouts.reconnect_s = 4.0
+    for name, value in hardware.items():
+        setattr(config.hardware.gate, name, value)
+    return config
+
+
+@pytest.fixture
+def start(twin_calibration, tmp_path):
+    """``start(...)``: session on a fresh twin, its twin, its one-transfer problem; closed afterwards."""
+    opened = []
+
+    def make(dry_run=False, **hardware):
+        config = lab_config(twin_calibration, tmp_path / "stop", **hardware)
+        log = tmp_path / "log.jsonl"
+        loop = make_loop(policies.adapted("exact"), "hardware", config=config, dry_run=dry_run, log_path=str(log))
+        opened.append(loop)
+        session = Session(loop, {"policy": "exact"})
+        goal = one_transfer(loop.rules.cell)
+        twin = session.backend.lab.twin
+        return SimpleNamespace(
+            session=session,
+            twin=twin,
+            clock=twin.clock,
+            log=log,
+            goal=GivenGoal(goal),
+            goal_pose=goal,
+            loop=loop,
+            counts=session.log.counts,
+        )
+
+    yield make
+    for loop in opened:
+        loop.backend.close()
+
+
+def lines(path):
+    return [json.loads(line, parse_constant=pytest.fail) for line in path.read_text().splitlines()]
+
+
+def when(lab, condition, act, every_s=0.02):
+    """Do ``act`` once, as soon as ``condition`` holds."""
+
+    def look():
+        if condition():
+            act()
+        else:
+            lab.clock.at(lab.clock.now_s() + every_s, look)
+
+    lab.clock.at(lab.clock.now_s(), look)
+
+
+def carried_high(lab):
+    return lab.twin.cell.block.height_mm() > 15.0
+
+
+def solved(lab, episode):
+    true = lab.twin.true_pose()
+    assert episode.solved
+    assert truly_solved(episode, lab.loop.rules)
+    assert math.dist(true[:2], episode.goal[:2]) < 5.0
+    assert abs(float(wrap(true[2] - episode.goal[2]))) < lab.loop.rules.epsilon_rad
+    return True
+
+
+def test_a_transfer_through_bytes_and_pixels_is_exact_to_some_mm(start):
+    lab = start()
+    episode = lab.session.play(START, lab.goal)
+    assert solved(lab, episode)
+    assert len(episode.transfers) == 1
+    done = episode.transfers[0].done
+    assert math.dist(done.truth[:2], lab.goal_pose[:2]) < 3.0
+    assert abs(float(wrap(done.truth[2] - lab.goal_pose[2]))) < math.radians(2.0)
+    assert math.dist(done.truth[:2], done.pose[:2]) < 1.5, "what the camera says is where it is"
+    assert not FAULTS & set(lab.counts)
+    rows = lines(lab.log)
+    kinds = [row["event"] for row in rows]
+    assert kinds[:5] == ["session", "episode", "armed", "seen", "goal"]
+    assert kinds[-2:] == ["transfer", "ended"]
+    states = [row for row in rows if row["event"] == "state"]
+    assert len(states) > 20
+    assert np.shape(states[0]["joints_rad"]) == (2, 5)
+    assert all(later["t_s"] >= row["t_s"] for row, later in pairwise(rows))
+
+
+def test_a_failed_grasp_is_seen_and_tried_again(start):
+    lab = start()
+    Mishaps(lab.twin, lab.loop.rules).arrange("missed_grasp", 0.3, lab.goal)
+    episode = lab.session.play(START, lab.goal)
+    assert solved(lab, episode)
+    assert lab.counts[Event.FAILED_GRASP] == 1
+    assert [str(transfer.done.refusal) for transfer in episode.transfers] == ["missed_grasp", "None"]
+
+
+def test_a_dropped_block_is_picked_up_where_it_lies(start):
+    lab = start()
+    when(lab, lambda: carried_high(lab), lambda: lab.twin.nudge([0.0, -20.0, 2.0]))
+    episode = lab.session.play(START, lab.goal)
+    assert solved(lab, episode)
+    assert lab.counts[Event.DROPPED] == 1
+
+
+def test_a_block_moved_while_a_hand_comes_near_calls_the_hand_back(start):
+    lab = start()
+    lab.clock.at(lab.clock.now_s() + 0.75, lambda: lab.twin.nudge(START + (18.0, 0.0, 0.2)))
+    episode = lab.session.play(START, lab.goal)
+    assert solved(lab, episode)
+    assert lab.counts[Event.BLOCK_MOVED] == 1
+    assert episode.transfers[0].done.refusal == "missed_grasp"
+    assert not lab.twin.follower.collisions
+
+
+def test_a_goal_that_changes_in_mid_motion_is_reached_after_the_transfer(start):
+    lab = start()
+    new = one_transfer(lab.loop.rules.cell, lab.goal_pose, [-30.0, -5.0])
+    when(lab, lambda: carried_high(lab), lambda: lab.goal.set(new))
+    episode = lab.session.play(START, lab.goal)
+    assert solved(lab, episode)
+    assert lab.counts[Event.GOAL_CHANGED] == 1
+    np.testing.assert_array_equal(episode.goal, new)
+    first = episode.transfers[0]
+    assert math.dist(first.done.truth[:2], lab.goal_pose[:2]) < 5.0, "the transfer that was under way was finished"
+
+
+def test_the_printed_goal_is_gone_for(start):
+    lab = start()
+    lab.twin.goal = lab.goal_pose
+    episode = lab.session.play(START, PrintedGoal(lab.session.backend))
+    assert math.dist(episode.goal[:2], lab.goal_pose[:2]) < 1.0
+    assert solved(lab, episode)
+
+
+def test_a_block_outside_all_reach_is_waited_for(start):
+    lab = start()
+    outside = np.array([230.0, 0.0, 0.0])
+    lab.clock.at(lab.clock.now_s() + 2.0, lambda: lab.twin.nudge(START))
+    episode = lab.session.play(outside, lab.goal)
+    assert solved(lab, episode)
+    assert lab.counts[Event.BLOCK_OUTSIDE] == 1
+    assert lab.counts[Event.RECOVERED] == 1
+    begun_s = lab.clock.now_s()
+    episode = lab.session.play(outside, lab.goal)
+    assert episode.ended == "stuck"
+    assert lab.clock.now_s() - begun_s < 30.0
+
+
+def test_a_hidden_marker_and_a_frozen_camera_are_waited_for(start):
+    lab = start()
+    lab.clock.at(lab.clock.now_s() + 3.5, lambda: lab.twin.hide(4.0))
+    episode = lab.session.play(START, lab.goal)
+    assert solved(lab, episode)
+    assert lab.counts[Event.MARKER_HIDDEN] == 1
+    lab.clock.at(lab.clock.now_s() + 3.5, lambda: lab.twin.freeze(3.0))
+    episode = lab.session.play(START, lab.goal)
+    assert solved(lab, episode)
+    assert lab.counts[Event.CAMERA_FROZEN] == 1
+
+
+def test_after_a_lost_cable_the_motion_goes_on_where_it_was(start):
+    lab = start()
+    when(lab, lambda: carried_high(lab), lambda: lab.twin.add_faults([make_fault("unplug", lab.clock.now_s(), 1.0)]))
+    episode = lab.session.play(START, lab.goal)
+    assert solved(lab, episode)
+    assert len(episode.transfers) == 1
+    assert lab.counts[Event.SERIAL_LOST] == 1
+    assert lab.counts[Event.RECOVERED] == 1
+
+
+def test_a_cable_that_stays_out_ends_the_session_in_time(start):
+    lab = start()
+    lab.twin.add_faults([make_fault("unplug", lab.clock.now_s() + 2.0, 1e6)])
+    with pytest.raises(DeviceError):
+        lab.session.play(START, lab.goal)
+    assert lab.clock.now_s() < 20.0
+
+
+def test_after_a_brown_out_somebody_parks_the_arms_and_the_loop_goes_on(start):
+    lab = start()
+    when(lab, lambda: carried_high(lab), lambda: lab.twin.add_faults([make_fault("brownout", lab.clock.now_s(), 0.3)]))
+    episode = lab.session.play(START, lab.goal)
+    assert solved(lab, episode)
+    assert lab.counts[Event.CONTROLLER_RESET] == 1
+    assert lab.counts[Event.ARMED] == 2
+    assert episode.transfers[0].done.refusal in ("dropped", "missed_grasp")
+
+
+def test_an_arm_that_does_nothing_time_and_again_is_stalled(start):
+    lab = start()
+    channel = lab.twin.hardware.arms[ARMS[0]].gripper.channel
+    lab.twin.add_faults([make_fault("jam", lab.clock.now_s(), None, channel)])
+    episode = lab.session.play(START, lab.goal)
+    assert episode.ended == "stuck"
+    assert lab.counts[Event.ARM_STALLED] >= 1
+    assert len(episode.transfers) < 8
+
+
+def test_what_the_gate_refuses_is_not_sent_and_the_arm_goes_home(start):
+    lab = start(step_deg=2.0)
+    episode = lab.session.play(START, lab.goal)
+    assert not episode.solved
+    assert lab.counts[Event.GATE_REFUSED] >= 1
+    assert math.dist(lab.twin.true_pose()[:2], START[:2]) < 1.0
+    assert np.degrees(np.abs(lab.twin.true_joints_rad() - lab.session.backend.check.parked_rad)).max() < 6.0
+
+
+def test_the_latched_stop_ends_the_session_where_it_is(start, tmp_path):
+    lab = start()
+    when(lab, lambda: carried_high(lab), lambda: StopLatch(tmp_path / "stop").latch("test"))
+    with pytest.raises(Stopped, match="test"):
+        lab.session.play(START, lab.goal)
+    assert lines(lab.log)[-1]["event"] == "stopped"
+    lab.clock.sleep_s(0.2)
+    before = lab.twin.true_joints_rad()
+    lab.clock.sleep_s(1.0)
+    np.testing.assert_allclose(lab.twin.true_joints_rad(), before, atol=math.radians(0.2))
+    assert StopLatch(tmp_path / "stop").obeyed_by() is not None
+
+
+def test_a_dry_run_does_everything_and_moves_nothing(start):
+    lab = start(dry_run=True)
+    joints = lab.twin.true_joints_rad()
+    episode = lab.session.play(START, lab.goal)
+    assert episode.solved
+    np.testing.assert_allclose(lab.twin.true_joints_rad(), joints, atol=1e-3)
+    assert math.dist(lab.twin.true_pose()[:2], START[:2]) < 0.5
+    assert not any(b"#" in line for device in lab.twin.electronics.devices.values() for _, line in device.lines)
+
+
+def test_without_a_calibration_there_is_no_twin(model, tmp_path):
+    with pytest.raises(MissingFile, match="calibrate"):
+        make_backend("twin", model, policies.adapted("exact").rules.config, MotionConfig(), calibration=str(tmp_path))

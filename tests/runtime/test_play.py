@@ -1,0 +1,94 @@
+"""Play is taken out exactly, and its file says what is wrong with it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
+from marl_handover.hardware.calibration import nominal_calibration
+from marl_handover.hardware.settings import ARMS, HardwareConfig
+from marl_handover.motion.trajectory import Phase
+from marl_handover.runtime.play import FILE, Play, half_bands_rad, load_play, save_play
+
+HALF = np.radians([[0.4, 0.5, 0.3, 0.4, 0.6], [0.2, 0.2, 0.2, 0.2, 0.2]])
+WIDE = np.full(5, 10.0)
+
+
+def followed(aims, start, half):
+    """Where servos with play stand along ``aims`` (n, 5): they move only when pushed by an edge of their band."""
+    here, way = start.copy(), []
+    for aim in aims:
+        here = np.clip(here, aim - half, aim + half)
+        way.append(here.copy())
+    return np.array(way)
+
+
+def phases_of(joints):
+    t_s = 0.02 * np.arange(len(joints))
+    middle = len(joints) // 2
+    return [
+        Phase("approach", t_s[: middle + 1], joints[: middle + 1], np.zeros(middle + 1)),
+        Phase("grasp", t_s[middle:], joints[middle:], np.zeros(len(joints) - middle)),
+    ]
+
+
+@given(st.integers(0, 10**6), st.integers(6, 60), st.sampled_from([0, 1]))
+def test_servos_with_play_go_where_they_are_wanted(seed, count, arm):
+    random = np.random.default_rng(seed)
+    steps = random.normal(0, 0.02, (count, 5)) * random.choice([0.0, 1.0], (count, 1), p=[0.2, 0.8])
+    steps[0] = random.choice([-1.0, 1.0], 5) * 3 * HALF[arm]
+    joints = np.cumsum(np.vstack([np.zeros(5), steps]), axis=0)
+    play = Play(HALF, -WIDE, WIDE)
+    led = play.led(arm, phases_of(joints))
+    aims = np.concatenate([led[0].joints_rad, led[1].joints_rad[1:]])
+    unknown = random.uniform(-1, 1, 5) * HALF[arm]
+    reached = followed(aims, joints[0] + unknown, HALF[arm])
+    np.testing.assert_allclose(reached[1:], joints[1:], atol=1e-12)
+
+
+def test_the_next_motion_begins_on_the_side_where_the_last_one_ended():
+    play = Play(HALF, -WIDE, WIDE)
+    up = np.linspace(0, 1, 11)[:, None] * np.ones(5)
+    led = play.led(0, phases_of(up))
+    play.done(0, up[-1], led[-1].joints_rad[-1])
+    np.testing.assert_allclose(play.lead_rad[0], HALF[0])
+    again = play.led(0, phases_of(up[::-1]))
+    np.testing.assert_allclose(again[0].joints_rad[0] - up[-1], HALF[0])
+    np.testing.assert_allclose(again[0].joints_rad[1] - up[-2], -HALF[0])
+    play.reset()
+    assert not play.lead_rad.any()
+
+
+def test_aims_keep_to_the_limits():
+    play = Play(HALF, np.zeros(5), np.ones(5))
+    led = play.led(0, phases_of(np.linspace(0, 1, 11)[:, None] * np.ones(5)))
+    assert led[1].joints_rad.max() == 1.0
+
+
+def test_half_a_band_is_an_angle_of_each_servo(planner):
+    arm = planner.model.arm
+    maps = [nominal_calibration(HardwareConfig(), name, arm) for name in ARMS]
+    found = np.degrees(half_bands_rad({"left": 4.0, "right": 2.0}, maps))
+    np.testing.assert_allclose(found, [[4 / 9.5, 4 / 9.2, 4 / 9.2, 4 / 9.5, 0.4], [2 / 9.5, 2 / 9.2, 2 / 9.2, 2 / 9.5, 0.2]])
+
+
+def test_file_round_trip_and_what_may_be_wrong_with_it(tmp_path):
+    with pytest.raises(MissingFile, match="calibrate"):
+        load_play(tmp_path)
+    save_play(tmp_path / "new", {"left": 3.9, "right": 4.2})
+    assert load_play(tmp_path / "new") == {"left": 3.9, "right": 4.2}
+    path = tmp_path / FILE
+    path.write_text("{")
+    with pytest.raises(CorruptFile):
+        load_play(tmp_path)
+    path.write_text(json.dumps({"version": 9, "half_band_us": {"left": 1, "right": 1}}))
+    with pytest.raises(CorruptFile, match="version"):
+        load_play(tmp_path)
+    path.write_text(json.dumps({"version": 1, "half_band_us": {"left": 1, "right": 99}}))
+    with pytest.raises(InvalidSetting, match="right"):
+        load_play(tmp_path)
