@@ -120,7 +120,7 @@ def _report(suite: Suite, whole: Suite, tasks: Sequence[Task], failures: dict[st
     """Write all numbers, tables and figures; print the tables. What an earlier report left and this one does not have goes away."""
     from marl_handover.compare.results import gather
     from marl_handover.compare.tables import csv_text, make_tables, markdown
-    from marl_handover.learning.recorder import write_whole
+    from marl_handover.files import write_whole
     from marl_handover.report.compare import make_figures
     from marl_handover.report.files import save_figure, write_json
 

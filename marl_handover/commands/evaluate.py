@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from marl_handover.errors import InvalidSetting, MissingFile
+from marl_handover.files import write_whole
 from marl_handover.learning.evaluation import Evaluation
-from marl_handover.learning.recorder import write_whole
 from marl_handover.runtime.assessment import AssessmentConfig, assess
 from marl_handover.task.rules import Outcome
 

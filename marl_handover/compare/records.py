@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from marl_handover.learning.recorder import write_whole
+from marl_handover.files import write_whole
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.resources import package_path
 from marl_handover.runtime.assessment import AssessmentConfig

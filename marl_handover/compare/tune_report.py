@@ -15,7 +15,7 @@ from optuna.trial import FrozenTrial
 from marl_handover.compare.records import settings_of, usual_settings
 from marl_handover.compare.tune import Search
 from marl_handover.compare.tune_space import applied
-from marl_handover.learning.recorder import write_whole
+from marl_handover.files import write_whole
 
 MEASURED = ("seed", "step", "success_rate", "mean_steps", "steps_ratio", "wall_s")
 OF_THE_RUN = ("seed", "steps", "device", "threads", "compile", "evaluation_interval", "evaluation_episodes", "checkpoint_interval")

@@ -6,10 +6,8 @@ two measured points. A servo rests anywhere in its dead band, hence each pulse i
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import os
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -24,6 +22,7 @@ from marl_handover.cell.kinematics import ArmModel
 from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import require_choice
 from marl_handover.errors import CorruptFile, HandoverError, InvalidSetting, MissingFile
+from marl_handover.files import write_whole
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 
 Floats = NDArray[np.float64]
@@ -131,22 +130,15 @@ class ArmCalibration:
         Raises :class:`InvalidSetting` if it cannot be written.
         """
         path = Path(path)
-        temporary, backup = path.with_name(path.name + ".tmp"), None
+        backup = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.exists():
                 backup = _free_name(path)
                 shutil.copy2(path, backup)
-            with temporary.open("w", encoding="utf-8") as file:
-                file.write(json.dumps(self._content(), indent=2, allow_nan=False) + "\n")
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
+            write_whole(path, json.dumps(self._content(), indent=2, allow_nan=False) + "\n")
         except OSError as error:
             raise InvalidSetting("calibration", str(path), f"a file that can be written ({error.strerror or error})") from error
-        finally:
-            with contextlib.suppress(OSError):
-                temporary.unlink(missing_ok=True)
         return backup
 
     def _content(self) -> dict[str, Any]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
+
+from marl_handover.files import write_whole
 
 COLUMNS = (
     "step",
@@ -30,16 +31,6 @@ COLUMNS = (
     "temperature_place",
     "temperature_branch",
 )
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file so that a reader sees the old one or the new one, never half of it."""
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w", encoding="utf-8") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(path)
 
 
 class Recorder:

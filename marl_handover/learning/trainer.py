@@ -16,11 +16,12 @@ from torch import Tensor
 
 from marl_handover.compose import to_yaml
 from marl_handover.errors import CheckpointMismatch, CorruptFile, InvalidSetting
+from marl_handover.files import write_whole
 from marl_handover.learning.algorithm_settings import OffPolicyConfig, PpoConfig
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
 from marl_handover.learning.curriculum import Curriculum
 from marl_handover.learning.experience import Collected
-from marl_handover.learning.recorder import Recorder, write_whole
+from marl_handover.learning.recorder import Recorder
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.variants import make_variant
 from marl_handover.task.planner import ExactPlanner

@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import json
 import math
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.errors import CorruptFile, HandoverError, MissingFile, WorkFailed
+from marl_handover.files import write_whole
 from marl_handover.perception.settings import MountConfig
 
 Floats = NDArray[np.float64]
@@ -116,14 +116,9 @@ class CameraCalibration:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(self._content(), indent=1) + "\n"
-        temporary = path.with_name(path.name + ".tmp")
-        with temporary.open("w") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
         if path.exists():
             shutil.copy2(path, path.with_name(path.name + ".bak"))
-        temporary.replace(path)
+        write_whole(path, text)
 
     def _content(self) -> dict[str, Any]:
         lens = self.intrinsics

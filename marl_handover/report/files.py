@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
-from marl_handover.learning.recorder import write_whole
+from marl_handover.files import write_whole
 
 PICTURES = (".png", ".pdf", ".svg")
 DOTS_PER_INCH = 150

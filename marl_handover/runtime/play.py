@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from marl_handover.config import require_between
 from marl_handover.errors import CorruptFile, MissingFile
+from marl_handover.files import write_whole
 from marl_handover.hardware.calibration import ArmCalibration
 from marl_handover.hardware.settings import ARMS
-from marl_handover.learning.recorder import write_whole
 from marl_handover.motion.trajectory import Phase
 
 Floats = NDArray[np.float64]
