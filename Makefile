@@ -1,7 +1,7 @@
 # Needs Linux, make and Python 3.11 (or 3.12) with venv and pip; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow check format bench pretrained wheel clean
+.PHONY: help demo test test-slow check format bench docs pretrained wheel clean
 
 SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
 PYTHON ?= $(firstword $(foreach p,python3.11 python3 python3.12,$(shell $(p) -c "$(SUITABLE)" 2>/dev/null && echo $(p))))
@@ -17,6 +17,7 @@ help:
 	@echo "make test       install and run the tests; make test-slow the slow ones (wheel, SIGKILL, longer learners)"
 	@echo "make check      style, types and import layers; make format repairs the style"
 	@echo "make bench      measure motion planning, speed, and learning against Stable-Baselines3 (hours)"
+	@echo "make docs       build the documentation site into site/; warnings are errors"
 	@echo "make pretrained train the two policies that are shipped"
 	@echo "make wheel      build a wheel into dist/"
 
@@ -57,6 +58,9 @@ bench: $(STAMP)
 	$(BIN)/python bench/motion.py
 	$(BIN)/python bench/run.py
 
+docs: $(STAMP)
+	$(BIN)/mkdocs build --strict --quiet
+
 # The policies that travel in the wheel; see the origin stored in each file.
 pretrained: $(STAMP)
 	$(RUN) train preset=pretrained architecture=A out=runs/pretrained_a
@@ -68,4 +72,4 @@ wheel: $(STAMP)
 	$(BIN)/python -m build --wheel --outdir dist .
 
 clean:
-	rm -rf .venv build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache
+	rm -rf .venv build dist site .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache

@@ -97,6 +97,18 @@ def _require_done(results: dict[str, Any], tasks: int, others: Sequence[str], re
         raise WorkFailed(f"not done, though no worker failed: {', '.join(results['missing'])}; do all machines share out=?")
 
 
+def _calibrate_twin(tasks: Sequence[Task]) -> None:
+    """Calibrate the twin as it is shipped, if a task is to be judged on it and nobody has done so yet."""
+    from marl_handover.commands import calibrate
+    from marl_handover.runtime.lab import is_calibrated
+    from marl_handover.runtime.settings import twin_lab
+
+    configs = [judgement.config for task in tasks for judgement in task.judgements]
+    if any(config.backend == "twin" and config.calibration is None for config in configs) and not is_calibrated(twin_lab().folder()):
+        print(f"calibrating the twin first, into {twin_lab().folder()}", file=sys.stderr)
+        calibrate.run(calibrate.CalibrateCommand(**vars(twin_lab())))
+
+
 def _run_tasks(config: CompareConfig, tasks: Sequence[Task]) -> tuple[dict[str, str], list[str]]:
     """Run what is not finished; name and reason of what failed, and names of what another call is at."""
     from marl_handover.compare.launch import Failure, fan_out
@@ -106,6 +118,7 @@ def _run_tasks(config: CompareConfig, tasks: Sequence[Task]) -> tuple[dict[str, 
     todo = [task for task in tasks if not finished(task)]
     if len(todo) < len(tasks):
         print(f"{len(tasks) - len(todo)} of {len(tasks)} runs are done already", file=sys.stderr)
+    _calibrate_twin(todo)
     failures, others = {}, []
     options: dict[str, Any] = {"launcher": config.launcher, "address": config.address, "jobs": config.jobs, "progress": config.progress}
     for task, result in fan_out(execute, todo, label=lambda task: task.name, **options):

@@ -20,6 +20,7 @@ from marl_handover.perception.detector import Detector
 from marl_handover.perception.sources import open_camera
 from marl_handover.perception.tracker import Tracker
 from marl_handover.runtime.events import EventLog
+from marl_handover.runtime.play import FILE as PLAY_FILE
 from marl_handover.runtime.play import Play, half_bands_rad, load_play
 from marl_handover.runtime.settings import LabConfig
 from marl_handover.runtime.twin import Twin
@@ -117,6 +118,11 @@ def open_lab(
         plugs.close()
         raise
     return Lab(config, driver, plugs.camera, watcher, play, plugs.clock, log, plugs.twin)
+
+
+def is_calibrated(folder: Path) -> bool:
+    """Whether every file that ``calibrate`` writes is in ``folder``."""
+    return all((folder / name).is_file() for name in (CAMERA_FILE, PLAY_FILE, *(f"{arm}.json" for arm in ARMS)))
 
 
 def camera_calibration(folder: Path) -> CameraCalibration:
