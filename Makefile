@@ -18,7 +18,7 @@ help:
 	@echo "make check      style, types and import layers; make format repairs the style"
 	@echo "make bench      measure motion planning, speed, and learning against Stable-Baselines3 (hours)"
 	@echo "make docs       build the documentation site into site/; warnings are errors"
-	@echo "make pretrained train the two policies that are shipped"
+	@echo "make pretrained train the three policies that are shipped"
 	@echo "make wheel      build a wheel into dist/"
 
 $(STAMP): pyproject.toml constraints.txt
@@ -67,6 +67,8 @@ pretrained: $(STAMP)
 	$(BIN)/python scripts/export_policy.py runs/pretrained_a marl_handover/pretrained/a.npz
 	$(RUN) train preset=pretrained architecture=B out=runs/pretrained_b
 	$(BIN)/python scripts/export_policy.py runs/pretrained_b marl_handover/pretrained/b.npz
+	$(RUN) train preset=twin architecture=B out=runs/pretrained_twin
+	$(BIN)/python scripts/export_policy.py runs/pretrained_twin marl_handover/pretrained/twin.npz
 
 wheel: $(STAMP)
 	$(BIN)/python -m build --wheel --outdir dist .

@@ -1,6 +1,6 @@
 """The twin in numbers: plain episodes, episodes with a mishap each, and a soak; through bytes and pixels, calibrated by `calibrate`.
 
-python bench/twin.py episodes=200 drills=200 soak=0 policy=pretrained_b seed=0 noise=1 results=bench/results
+python bench/twin.py episodes=200 drills=200 soak=0 policy=pretrained_twin seed=0 noise=1 results=bench/results
 
 `noise` multiplies dead band, resting noise, scale and zero errors of the servos. `soak` is a number of transfers, in episodes one after the
 other; memory and open files are looked at along the way.
@@ -35,7 +35,7 @@ from marl_handover.runtime.session import GivenGoal, Session
 from marl_handover.runtime.settings import LabConfig, twin_lab
 from marl_handover.task.rules import Outcome
 
-DEFAULTS = {"episodes": 200, "drills": 200, "soak": 0, "policy": "pretrained_b", "seed": 0, "noise": 1.0, "results": "bench/results"}
+DEFAULTS = {"episodes": 200, "drills": 200, "soak": 0, "policy": "pretrained_twin", "seed": 0, "noise": 1.0, "results": "bench/results"}
 MISHAP_S = (0.3, 7.0)
 NOISES = ("dead_band_us", "settle_sd_us", "scale_sd", "offset_sd_us")
 

@@ -36,7 +36,7 @@ class PlanConfig:
 
     start: list[float] = field(default_factory=lambda: [-120.0, -60.0, 0.0])  # x [mm], y [mm], orientation [deg]
     goal: list[float] = field(default_factory=lambda: [150.0, 60.0, 90.0])  # x [mm], y [mm], orientation [deg]
-    policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
+    policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, pretrained_twin, a run directory or a policy file
     cell: CellConfig | None = None  # null: the policy's own, or paper; single keys change the paper cell
     architecture: str | None = None  # A or B; null: the policy's own, or B
     epsilon_deg: float | None = None  # allowed orientation error; null: the policy's own, or 5
@@ -117,7 +117,8 @@ def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> N
             f"{schedule.overlapped_s:.2f} s, {100 * schedule.saved:.0f} % less"
         )
     if config.motion:
-        write_json(Path(config.motion), {"transfers": [motion_row(motion) for motion in motions]}, "motion")
+        settings = {"cell_settings": asdict(planner.model.cell.config), "motion_settings": asdict(planner.motion)}
+        write_json(Path(config.motion), {**settings, "transfers": [motion_row(motion) for motion in motions]}, "motion")
     if config.motion_picture:
         from marl_handover.report.motion import motion_figure
 

@@ -22,14 +22,14 @@ from marl_handover.policies.shielded import SHIELDED, ShieldedPolicy
 from marl_handover.resources import package_path
 from marl_handover.task.rules import Rules
 
-NAMES = ("exact", "random", "greedy", "pretrained_a", "pretrained_b")
+NAMES = ("exact", "random", "greedy", "pretrained_a", "pretrained_b", "pretrained_twin")
 
 
 def load(
     name: str, cell: Cell | None = None, task: TaskConfig | None = None, seed: int = 0, *, motion: MotionConfig | None = None
 ) -> SupervisorPolicy:
-    """A policy by name: ``exact``, ``random``, ``greedy``, ``pretrained_a``, ``pretrained_b``, a run directory or a policy file (``.npz``),
-    or any of these shielded, as ``shielded:NAME``.
+    """A policy by name: ``exact``, ``random``, ``greedy``, ``pretrained_a``, ``pretrained_b``, ``pretrained_twin``, a run
+    directory or a policy file (``.npz``), or any of these shielded, as ``shielded:NAME``.
 
     Args:
         name: see above.

@@ -42,7 +42,7 @@ BACKENDS = ("kinematic", "noisy", "bullet", "twin")
 class AssessmentConfig:
     """Who is judged, where, on which problems. What is not given is the policy's own, or the default."""
 
-    policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
+    policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, pretrained_twin, a run directory or a policy file
     backend: str = "kinematic"  # where transfers are executed: kinematic, or in closed loop with planned motions noisy, bullet or twin
     episodes: int = 1000  # random problems
     seed: int = 0  # of the problems and of execution noise
