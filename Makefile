@@ -59,7 +59,8 @@ bench: $(STAMP)
 	$(BIN)/python bench/run.py
 
 docs: $(STAMP)
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "The site is in site/; python -m http.server --directory site shows it"
 
 # The policies that travel in the wheel; see the origin stored in each file.
 pretrained: $(STAMP)

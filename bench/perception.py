@@ -2,9 +2,9 @@
 
 python bench/perception.py frames=1200 boards=20 seed=0 results=bench/results
 
-Each of twelve cameras hangs a little differently, is calibrated by itself (lens: boards held before it; place: a board at three places on
-the table), stored and loaded. Then it sees block and goal anywhere, with another blur, noise and light every ten pictures, half of the
-pictures cluttered, the arms parked, the pin in its place. Times are of a processor, one thread.
+Each of twelve cameras hangs a little differently, is calibrated by itself (lens: boards held before it; place: a board laid at three places
+on the table, as exactly as the twin's people lay one), stored and loaded. Then it sees block and goal anywhere, with another blur, noise
+and light every ten pictures, half of the pictures cluttered, the arms parked, the pin in its place. Times are of a processor, one thread.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from marl_handover.perception.intrinsics import calibrate_lens
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.perception.settings import BoardConfig, LookConfig, MountConfig
+from marl_handover.runtime.settings import TwinConfig
 
 DEFAULTS = {"frames": 1200, "cameras": 12, "boards": 20, "seed": 0, "results": "bench/results"}
 SIZE_PX = (1280, 720)
@@ -83,7 +84,15 @@ def calibrated(model: CellModel, truth: CameraCalibration, boards: int, seed: in
     painter = CellPainter(model, truth, look=LookConfig(), seed=seed)
     sheet = charuco_sheet(board, margin_mm=10)
     lens = calibrate_lens((painter.picture(None, sheets=[(sheet, T)]) for T in held_boards(truth, boards, seed)), board)
-    views = [BoardOnTable(painter.picture(None, sheets=[(sheet, flat_pose(*place))]), *place) for place in PLACES]
+    people, random = TwinConfig(), np.random.default_rng([seed, 1])
+    laid = np.array(PLACES) + random.normal(size=(len(PLACES), 3)) * (
+        people.board_sd_mm,
+        people.board_sd_mm,
+        math.radians(people.board_sd_deg),
+    )
+    views = [
+        BoardOnTable(painter.picture(None, sheets=[(sheet, flat_pose(*lies))]), *place) for lies, place in zip(laid, PLACES, strict=True)
+    ]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "camera.json"
         locate_by_board(lens, views, board).save(path)

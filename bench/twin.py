@@ -1,154 +1,222 @@
 """The twin in numbers: plain episodes, episodes with a mishap each, and a soak; through bytes and pixels, calibrated by `calibrate`.
 
-python bench/twin.py episodes=200 drills=200 soak=0 policy=pretrained_twin seed=0 noise=1 results=bench/results
+python bench/twin.py episodes=200 drills=200 soak=5000 robots=10 jobs=2 seed=0 noise=1 policy=pretrained_twin folder=runs/bench_twin
 
-`noise` multiplies dead band, resting noise, scale and zero errors of the servos. `soak` is a number of transfers, in episodes one after the
-other; memory and open files are looked at along the way.
+The episodes are spread over ``robots``: each has servos, camera, glue and paper of its own, drawn from ``seed``, and is calibrated by
+itself. ``noise`` multiplies everything that is drawn: dead bands, resting noise, scales, zeros, the cards' glue, the boards' laying, the
+camera's noise and blur. ``soak`` is a number of transfers of robot 0, in episodes one after the other.
+
+What is finished is in ``folder``, and is not done again: the same command goes on where it was killed. Other settings want another folder.
 """
 
 from __future__ import annotations
 
 import datetime
 import json
-import math
+import multiprocessing
 import os
 import sys
-import tempfile
 import time
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from common import ROOT, commit, machine, parse, table
+from twin_work import Work, append, robot_changes, rows, work
 
-from marl_handover import policies
-from marl_handover.cli import main as command_line
-from marl_handover.learning.evaluation import random_problems
-from marl_handover.runtime.episode import Episode
-from marl_handover.runtime.evaluation import loop_report, true_outcome, truly_solved
-from marl_handover.runtime.events import FAULTS
-from marl_handover.runtime.loop import ClosedLoop, make_loop
-from marl_handover.runtime.mishaps import Mishaps
-from marl_handover.runtime.session import GivenGoal, Session
-from marl_handover.runtime.settings import LabConfig, twin_lab
-from marl_handover.task.rules import Outcome
-
-DEFAULTS = {"episodes": 200, "drills": 200, "soak": 0, "policy": "pretrained_twin", "seed": 0, "noise": 1.0, "results": "bench/results"}
-MISHAP_S = (0.3, 7.0)
-NOISES = ("dead_band_us", "settle_sd_us", "scale_sd", "offset_sd_us")
-
-
-def calibrated_lab(folder: str, noise: float) -> LabConfig:
-    """The twin with its servos' errors multiplied, after `calibrate` has been run on it."""
-    config = twin_lab()
-    emulator = config.hardware.emulator
-    for name in NOISES:
-        setattr(emulator, name, noise * getattr(emulator, name))
-    changes = [f"hardware.emulator.{name}={getattr(emulator, name)}" for name in NOISES]
-    config.calibration, config.hardware.stop_file = folder, f"{folder}/stop"
-    if command_line(["calibrate", "hardware=twin", f"calibration={folder}", f"hardware.stop_file={folder}/stop", *changes]) != 0:
-        raise SystemExit("calibration failed")
-    return config
+DEFAULTS = {
+    "episodes": 200,
+    "drills": 200,
+    "soak": 0,
+    "robots": 10,
+    "jobs": 2,
+    "seed": 0,
+    "noise": 1.0,
+    "policy": "pretrained_twin",
+    "folder": "runs/bench_twin",
+    "results": "bench/results",
+}
+BARS = {"first_time": 0.95, "in_the_end": 0.98, "drills": 0.95, "latency_ms": 150.0}
+_SAME = ("episodes", "drills", "soak", "robots", "seed", "noise", "policy")
 
 
-def opened(config: LabConfig, policy: str) -> tuple[ClosedLoop, Session]:
-    """A fresh twin with a policy at work."""
-    loop = make_loop(policies.adapted(policy), "hardware", config=config)
-    return loop, Session(loop, {"policy": policy})
+def claim(root: Path, values: dict[str, Any]) -> None:
+    """Make ``root`` the folder of these settings; ends the program if it is another's."""
+    root.mkdir(parents=True, exist_ok=True)
+    mine, path = {key: values[key] for key in _SAME}, root / "settings.json"
+    if not path.exists():
+        path.write_text(json.dumps(mine) + "\n")
+    elif (found := json.loads(path.read_text())) != mine:
+        sys.exit(f"{root} holds results of other settings: {found}; give another folder= or remove it")
+    now = datetime.datetime.now().isoformat(timespec="seconds")
+    append(root / "started.jsonl", {"at": now, "commit": commit(), **machine(values["jobs"])})
 
 
-def plain(config: LabConfig, policy: str, count: int, seed: int) -> dict[str, Any]:
-    """Random episodes."""
-    loop, session = opened(config, policy)
-    with loop:
-        played: list[Episode] = []
-        for number, (start, goal) in enumerate(zip(*random_problems(loop.rules, count, seed), strict=True)):
-            played.append(session.play(start, GivenGoal(goal), seed + number))
-            progress("episode", number, count)
-        first = sum(true_outcome(episode, loop.rules) is Outcome.SUCCESS for episode in played)
-        faults = {str(event): number for event, number in session.log.counts.items() if event in FAULTS}
-        touches = sorted(session.backend.lab.twin.follower.collisions) if session.backend.lab.twin else []
-        return {"episodes": count, "first_time": first / count, **loop_report(played, loop.rules), "events": faults, "collisions": touches}
+def tasks(root: Path, values: dict[str, Any]) -> list[Work]:
+    """What is still to be done, the longest first; a robot's parts one after the other, as its calibration is."""
+    found = [Work("soak", 0, (), values["soak"])] if values["soak"] else []
+    for robot in range(values["robots"]):
+        for part in ("episode", "drill"):
+            count = values[f"{part}s"]
+            done = {row["number"] for row in rows(root / f"robot_{robot:02d}" / f"{part}.jsonl")}
+            left = tuple(number for number in range(robot, count, values["robots"]) if number not in done)
+            if left:
+                found.append(Work(part, robot, left, count))
+    return found
 
 
-def drilled(config: LabConfig, policy: str, count: int, seed: int) -> dict[str, Any]:
-    """Random episodes with a mishap each, the kinds in turn, at random times."""
-    loop, session = opened(config, policy)
-    with loop:
-        twin = session.backend.lab.twin
-        assert twin is not None
-        mishaps, random, reached, longest_s = Mishaps(twin, loop.rules, seed), np.random.default_rng(seed), Counter(), 0.0
-        for number, (start, goal) in enumerate(zip(*random_problems(loop.rules, count, seed), strict=True)):
-            kind, given, begun_s = mishaps.kinds[number % len(mishaps.kinds)], GivenGoal(goal), twin.clock.now_s()
-            mishaps.arrange(kind, float(random.uniform(*MISHAP_S)), given)
-            reached[kind, truly_solved(session.play(start, given, seed + number), loop.rules)] += 1
-            longest_s = max(longest_s, twin.clock.now_s() - begun_s)
-            progress("drill", number, count)
-        kinds = {kind: {"reached": reached[kind, True], "of": reached[kind, True] + reached[kind, False]} for kind in mishaps.kinds}
-        share = sum(row["reached"] for row in kinds.values()) / count
-        return {"drills": count, "reached": share, "kinds": kinds, "longest_s": longest_s, "collisions": sorted(twin.follower.collisions)}
+def run(root: Path, values: dict[str, Any]) -> None:
+    """Calibrate every robot, then do all tasks, in ``jobs`` processes."""
+    left = tasks(root, values)
+    first = [Work("calibration", robot, (), 0) for robot in sorted({task.robot for task in left})]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(values["jobs"], mp_context=context, max_tasks_per_child=1) as pool:
+        for batch in (first, left):
+            for done in [pool.submit(work, task, values, str(root)) for task in batch]:
+                if (failure := done.exception()) is not None:
+                    print(f"broken off: {type(failure).__name__}: {failure}", flush=True)
 
 
-def soaked(config: LabConfig, policy: str, transfers: int, seed: int) -> dict[str, Any]:
-    """Episodes until so many transfers are done; memory, open files and success in four parts."""
-    loop, session = opened(config, policy)
-    with loop:
-        parts, done, solved, count = [], 0, 0, 0
-        starts, goals = random_problems(loop.rules, transfers, seed)
-        for start, goal in zip(starts, goals, strict=True):
-            episode = session.play(start, GivenGoal(goal), seed + count)
-            done, solved, count = done + len(episode.transfers), solved + truly_solved(episode, loop.rules), count + 1
-            if done >= transfers * (len(parts) + 1) / 4:
-                parts.append(
-                    {"transfers": done, "solved": solved, "episodes": count, "rss_mb": rss_mb(), "files": len(os.listdir("/proc/self/fd"))}
-                )
-                solved = count = 0
-            if len(parts) == 4:
-                break
-        twin = session.backend.lab.twin
-        return {"parts": parts, "virtual_s": twin.clock.now_s() if twin else math.nan}
+def quantiles(found: list[float]) -> dict[str, float | None]:
+    """p50, p95, p99 and the greatest."""
+    return {name: float(np.percentile(found, at)) if found else None for name, at in (("p50", 50), ("p95", 95), ("p99", 99), ("max", 100))}
 
 
-def rss_mb() -> float:
-    """Memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return round(pages * os.sysconf("SC_PAGE_SIZE") / 2**20, 1)
+def limits(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """Violations by name, and the worst values."""
+    violations, worst = Counter[str](), dict[str, float]()
+    for row in found:
+        violations.update(row.get("limits", {}).get("violations", {}))
+        for name, value in row.get("limits", {}).get("worst", {}).items():
+            worst[name] = max(value, worst.get(name, value))
+    return {"violations": dict(violations), "worst": worst}
 
 
-def progress(what: str, number: int, count: int) -> None:
-    """One line that stays one line."""
-    print(f"\r{what} {number + 1}/{count}", end="", file=sys.stderr, flush=True)
+def common(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """What plain episodes and drills have both."""
+    events = Counter[str]()
+    for row in found:
+        events.update(row.get("events", {}))
+    return {
+        "count": len(found),
+        "in_the_end": sum(row["end"] for row in found) / len(found),
+        "hangs": sum(row["hang"] for row in found),
+        "exceptions": [f"{row['number']}: {row['error']}" for row in found if "error" in row],
+        "failed": [row["number"] for row in found if not row["end"]],
+        "events": dict(events),
+        **limits(found),
+        "virtual_s": quantiles([row["virtual_s"] for row in found if "virtual_s" in row]),
+        "wall_s": quantiles([row["wall_s"] for row in found if "wall_s" in row]),
+        "cpu_s": quantiles([row["cpu_s"] for row in found if "cpu_s" in row]),
+    }
+
+
+def plain(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """Plain episodes."""
+    off = [pair for row in found for pair in row.get("transfer_off", [])]
+    final = [row["final_off"] for row in found if row.get("final_off")]
+    robots = {
+        str(robot): [sum(row["first"] for row in found if row["robot"] == robot), sum(row["robot"] == robot for row in found)]
+        for robot in sorted({row["robot"] for row in found})
+    }
+    return common(found) | {
+        "first_time": sum(row["first"] for row in found) / len(found),
+        "first_time_by_robot": robots,
+        "transfer_mm": quantiles([mm for mm, _ in off]),
+        "transfer_deg": quantiles([deg for _, deg in off]),
+        "final_mm": quantiles([mm for mm, _ in final]),
+        "final_deg": quantiles([deg for _, deg in final]),
+    }
+
+
+def drilled(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """Drills; ``happened``: in the episode; ``felt``: and left a sign in the log; ``reached``: of those that happened."""
+    kinds: dict[str, dict[str, int]] = {}
+    for row in found:
+        it = kinds.setdefault(row.get("kind", "broken off"), {"drills": 0, "happened": 0, "felt": 0, "reached": 0})
+        happened = row.get("happened", True)
+        for key, value in (
+            ("drills", True),
+            ("happened", happened),
+            ("felt", row.get("felt", False)),
+            ("reached", happened and row["end"]),
+        ):
+            it[key] += int(value)
+    happened = [row for row in found if row.get("happened", True)]
+    share = sum(row["end"] for row in happened) / len(happened) if happened else None
+    latency = quantiles([value for row in found for value in row.get("latency_ms", [])])
+    return common(found) | {"happened": len(happened), "reached": share, "kinds": kinds, "goal_to_wire_ms": latency}
+
+
+def soaked(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """The soak in four parts, and its totals."""
+    parts = [
+        {
+            **{key: sum(row[key] for row in some) for key in ("transfers", "episodes", "solved", "first", "violations", "hangs")},
+            **{"rss_mb": [some[0]["rss_mb"], some[-1]["rss_mb"]], "files": some[-1]["files"]},
+        }
+        for some in (list(part) for part in np.array_split(np.array(found, dtype=object), min(4, len(found))))
+    ]
+    return {"transfers": sum(row["transfers"] for row in found), "processes": len({row["process"] for row in found}), "parts": parts}
+
+
+def gathered(root: Path, values: dict[str, Any]) -> dict[str, Any]:
+    """All results there are in ``root``."""
+    found: dict[str, Any] = {"robots": [robot_changes(values["seed"], n, values["noise"]) for n in range(values["robots"])]}
+    for part, summed in (("episode", plain), ("drill", drilled), ("soak", soaked)):
+        every = [row for path in sorted(root.glob(f"robot_*/{part}.jsonl")) for row in rows(path)]
+        if every:
+            found[{"episode": "episodes", "drill": "drills", "soak": "soak"}[part]] = summed(every)
+    return found
+
+
+def shown(found: dict[str, Any]) -> str:
+    """The results as a table."""
+    lines: list[list[str]] = []
+
+    def spread(it: dict[str, Any], unit: str) -> str:
+        return " / ".join("-" if it[key] is None else f"{it[key]:.2f}" for key in ("p50", "p95", "p99")) + f" {unit}"
+
+    def both(it: dict[str, Any]) -> None:
+        lines.extend(
+            [["  limit violations", json.dumps(it["violations"])], ["  hangs, exceptions", f"{it['hangs']}, {len(it['exceptions'])}"]]
+        )
+
+    if it := found.get("episodes"):
+        lines += [[f"{it['count']} episodes: first final placement (95)", f"{100 * it['first_time']:.1f} %"]]
+        lines += [["  in the end (98)", f"{100 * it['in_the_end']:.1f} %"]]
+        lines += [["  a transfer, p50 / p95 / p99", spread(it["transfer_mm"], "mm") + ", " + spread(it["transfer_deg"], "deg")]]
+        lines += [["  first final placement", spread(it["final_mm"], "mm") + ", " + spread(it["final_deg"], "deg")]]
+        both(it)
+    if it := found.get("drills"):
+        reached = "-" if it["reached"] is None else f"{100 * it['reached']:.1f} %"
+        lines += [[f"{it['count']} drills, {it['happened']} happened: in the end (95)", reached]]
+        words = ("reached", "happened", "felt", "drills")
+        lines += [[f"  {kind}", ", ".join(f"{row[word]} {word}" for word in words)] for kind, row in it["kinds"].items()]
+        lines += [["  goal changed to a move on the wire (150)", spread(it["goal_to_wire_ms"], "ms")]]
+        both(it)
+    for part in found.get("soak", {}).get("parts", []):
+        memory = f"{part['rss_mb'][0]} to {part['rss_mb'][1]} MB, {part['files']} files"
+        lines.append([f"soak, {part['transfers']} transfers", f"{part['first']} / {part['solved']} of {part['episodes']}, {memory}"])
+    return table(["what (bar)", "result"], lines)
 
 
 def main(arguments: list[str]) -> None:
     values = parse(arguments, DEFAULTS)
-    begun, found = time.perf_counter(), dict[str, Any]()
-    with tempfile.TemporaryDirectory() as folder:
-        config = calibrated_lab(folder, float(values["noise"]))
-        for key, work in (("episodes", plain), ("drills", drilled), ("soak", soaked)):
-            if values[key]:
-                found[key] = work(config, values["policy"], int(values[key]), int(values["seed"]))
-    rows = []
-    if "episodes" in found:
-        it = found["episodes"]
-        error = f"{it['transfer_error_mm']['p50']:.2f} / {it['transfer_error_mm']['p95']:.2f} mm"
-        rows += [["first final placement", f"{100 * it['first_time']:.1f} %"], ["in the end", f"{100 * it['success_in_the_end']:.1f} %"]]
-        rows += [["one transfer, p50 / p95", error], ["an episode, wall", f"{it['episode_s']['p50']:.1f} s"]]
-    if "drills" in found:
-        rows += [["with a mishap: in the end", f"{100 * found['drills']['reached']:.1f} %"]]
-        rows += [[f"  {kind}", f"{row['reached']} of {row['of']}"] for kind, row in found["drills"]["kinds"].items()]
-    for part in found.get("soak", {}).get("parts", []):
-        rows.append(
-            [f"soak, {part['transfers']} transfers", f"{part['solved']} of {part['episodes']}, {part['rss_mb']} MB, {part['files']} files"]
-        )
-    print("\n" + table(["what", "result"], rows))
+    root, begun = ROOT / values["folder"], time.perf_counter()
+    claim(root, values)
+    run(root, values)
+    found = gathered(root, values)
+    print("\n" + shown(found))
     target = ROOT / values["results"] / datetime.date.today().isoformat()
     target.mkdir(parents=True, exist_ok=True)
-    about = {"settings": values, "commit": commit(), "machine": machine(1), "wall_s": time.perf_counter() - begun}
+    about = {"settings": values, "commit": commit(), "machine": machine(values["jobs"]), "started": rows(root / "started.jsonl")}
     name = "twin.json" if float(values["noise"]) == 1.0 else f"twin_noise{values['noise']:g}.json"
-    (target / name).write_text(json.dumps({**about, **found}, indent=1) + "\n")
+    (target / name).write_text(json.dumps({**about, "wall_s": time.perf_counter() - begun, "bars": BARS, **found}, indent=1) + "\n")
     print(f"-> {target / name}")
 
 

@@ -41,6 +41,7 @@ COMMANDS: dict[str, Command] = {
     "run": Command("the closed loop on hardware or its twin; dry_run=true moves nothing", "marl_handover.commands.run"),
     "stop": Command("stop all arms, and keep them stopped until clear=true", "marl_handover.commands.stop"),
     "emulate": Command("a servo controller on a pseudo-terminal, with faults if wanted", "marl_handover.commands.emulate"),
+    "view": Command("the cell in a browser: to play with, a trace, a session", "marl_handover.commands.view"),
     "plot": Command("a figure of a run, a trace or a cell", "marl_handover.commands.plot"),
 }
 

@@ -18,7 +18,9 @@ from marl_handover.errors import MissingFile
 from marl_handover.resources import resource_path
 
 
-class _Row(NamedTuple):
+class KeyRow(NamedTuple):
+    """A key, its type or choices, its default and its comment, as text."""
+
     key: str
     kind: str
     default: str
@@ -39,8 +41,20 @@ def keys_help(schema: type, aliases: Mapping[str, str] | None = None, groups: Gr
         groups: options that are code; each option's own keys get a block.
         configs: folder with the YAML options; the shipped one unless given.
     """
-    if not fields(schema):
+    rows = key_rows(schema, aliases, groups, configs)
+    if not rows:
         return "no keys"
+    widths = [max(len(row[column]) for row in rows) for column in range(3)]
+    widths = [min(width, limit) for width, limit in zip(widths, (44, 28, 24), strict=True)]
+    return "\n".join("  ".join([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row.doc]).rstrip() for row in rows)
+
+
+def key_rows(
+    schema: type, aliases: Mapping[str, str] | None = None, groups: Groups | None = None, configs: Path | None = None
+) -> list[KeyRow]:
+    """What :func:`keys_help` prints, row by row; same arguments; empty for a schema without fields."""
+    if not fields(schema):
+        return []
     if configs is None:
         try:
             configs = resource_path("configs")
@@ -50,32 +64,29 @@ def keys_help(schema: type, aliases: Mapping[str, str] | None = None, groups: Gr
     rows = list(_rows(schema, "", groups or {}, configs))
     presets = option_names(configs / "preset")
     if presets and "preset" not in {field.name for field in fields(schema)}:
-        rows.append(_Row("preset", " | ".join(presets), "", "named differences over all keys; or a YAML file"))
-    rows = [row._replace(key=f"{short[row.key]} = {row.key}" if row.key in short else row.key) for row in rows]
-    widths = [max(len(row[column]) for row in rows) for column in range(3)]
-    widths = [min(width, limit) for width, limit in zip(widths, (44, 28, 24), strict=True)]
-    return "\n".join("  ".join([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row.doc]).rstrip() for row in rows)
+        rows.append(KeyRow("preset", " | ".join(presets), "", "named differences over all keys; or a YAML file"))
+    return [row._replace(key=f"{short[row.key]} = {row.key}" if row.key in short else row.key) for row in rows]
 
 
-def _rows(schema: type, prefix: str, groups: Groups, configs: Path) -> Iterator[_Row]:
+def _rows(schema: type, prefix: str, groups: Groups, configs: Path) -> Iterator[KeyRow]:
     notes, hints = _notes(schema), get_type_hints(schema)
     for field in fields(schema):
         key = prefix + field.name
         note = notes.get(field.name, _FieldNotes(getattr(hints[field.name], "__name__", str(hints[field.name])), ""))
         default = field.default_factory() if field.default_factory is not MISSING else field.default
         if key in groups:
-            yield _Row(key, " | ".join(groups[key]), str(getattr(default, "name", "")), note.doc)
+            yield KeyRow(key, " | ".join(groups[key]), str(getattr(default, "name", "")), note.doc)
             for name, option in groups[key].items():
                 own = [row for row in _rows(option, f"{key}.", groups, configs) if row.key != f"{key}.name"]
                 yield from (row._replace(doc=f"[{name}] {row.doc}".rstrip()) for row in own)
             continue
         section = type(default) if is_dataclass(default) else without_none(hints[field.name])
         if not (isinstance(section, type) and is_dataclass(section)):
-            yield _Row(key, note.kind, _show(default), note.doc)
+            yield KeyRow(key, note.kind, _show(default), note.doc)
             continue
         options = option_names(configs / field.name) if field.name != "preset" else ()
         if options or note.doc:
-            yield _Row(key, " | ".join((*options, "FILE.yaml")), "", note.doc)
+            yield KeyRow(key, " | ".join((*options, "FILE.yaml")), "", note.doc)
         yield from _rows(section, f"{key}.", groups, configs)
 
 

@@ -17,6 +17,17 @@ settings.load_profile("repeatable")
 torch.set_num_threads(1)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _sign_up_here(tmp_path_factory):
+    """Sessions of tests stay off the user's roll: they do not answer when somebody stops real arms meanwhile."""
+    from marl_handover.hardware import roll
+
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("user")
+        patch.setattr(roll, "user_path", lambda suffix: folder / suffix)
+        yield
+
+
 @pytest.fixture(scope="session")
 def paper() -> Cell:
     return load_cell("paper")

@@ -12,6 +12,7 @@ from marl_handover.cell.spaces import AnnulusFit, ManipulationGrid, fit_annulus,
 from marl_handover.cell.urdf import read_urdf
 from marl_handover.compose import from_yaml, to_yaml
 from marl_handover.config import CellConfig, require_at_least, require_between, require_choice, require_positive
+from marl_handover.errors import MissingFile
 from marl_handover.resources import resource_path
 
 
@@ -27,7 +28,12 @@ class CellModel(NamedTuple):
 def urdf_path(urdf: str) -> Path:
     """A URDF by path, or by the name of a shipped one."""
     path = Path(urdf)
-    return path if path.exists() or path.parent != Path() else resource_path(f"urdf/{urdf}")
+    if path.exists() or path.parent != Path():
+        return path
+    try:
+        return resource_path(f"urdf/{urdf}")
+    except MissingFile as error:
+        raise MissingFile("URDF", urdf, "name a file here, a path, or one of those that are shipped: al5a.urdf") from error
 
 
 def build_cell(config: CellConfig) -> CellModel:

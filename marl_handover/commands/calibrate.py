@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from marl_handover.cell import build_cell
 from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.commands.person import Person, confirmed
-from marl_handover.config import CellConfig, MotionConfig, require_between, require_choice
+from marl_handover.config import CellConfig, MotionConfig, require_between, require_choice, require_positive
 from marl_handover.hardware.settings import ARMS
 from marl_handover.runtime.settings import LabConfig
 
@@ -19,7 +18,15 @@ if TYPE_CHECKING:
     from marl_handover.hardware.calibration import ArmCalibration
     from marl_handover.runtime.camera_calibration import Assistant
     from marl_handover.runtime.lab import Plugs
+    from marl_handover.runtime.servo_calibration import Measured
 
+DOUBTFUL_MM = 1.5
+"""Sightings of sound servos are less far off, with errors twice the usual ones as well."""
+
+_SUSPECTS = (
+    "does the camera hang as it was calibrated, is each hand's own marker where cards.place_mm says, is a horn loose, are the links the "
+    "cell's?"
+)
 _CUT_MM = 10.0
 WHAT = ("all", "camera", "servos", "sheets")
 
@@ -31,6 +38,7 @@ class CalibrateCommand(LabConfig):
     what: str = "all"  # camera, servos (which needs the camera's), all (both), or sheets: writes what has to be printed
     paper: str = "a4"  # of the sheets: a4, a3 or letter
     postures: int = 60  # of each arm
+    worst_mm: float = 3.0  # servos that explain the sightings no better are not saved
     views: int = 20  # of the board, held before the camera
     seed: int = 0  # of the postures
     cell: CellConfig = field(default_factory=CellConfig)
@@ -49,8 +57,12 @@ def run(config: CalibrateCommand) -> int:
     require_choice("what", config.what, WHAT)
     require_between("postures", config.postures, 12, 500)
     require_between("views", config.views, 8, 200)
+    require_positive("worst_mm", config.worst_mm)
     model = build_cell(config.cell)
     if config.what == "sheets":
+        config.board.validate()
+        config.target.validate()
+        config.cards.validate(config.target)
         return _sheets(config, model)
     plugs = plug_in(config, model, config.motion, confirmed)
     try:
@@ -97,28 +109,55 @@ def _servos(config: CalibrateCommand, plugs: Plugs, assistant: Assistant, model:
     from marl_handover.hardware.driver import ArmDriver
     from marl_handover.hardware.latch import StopLatch
     from marl_handover.runtime.lab import camera_calibration
-    from marl_handover.runtime.play import save_play
     from marl_handover.runtime.servo_calibration import ServoCalibration
+    from marl_handover.runtime.servo_files import save_servos
 
     seen_by = camera_calibration(config.folder())
     assistant.glue_cards()
     latch = StopLatch(plugs.hardware.stop_path())
     driver = ArmDriver(plugs.hardware, model, config.motion, clock=plugs.clock, latch=latch, confirm=plugs.confirm)
-    half_us: dict[str, float] = {}
+    found: dict[str, Measured] = {}
     with driver:
         driver.arm()
         procedure = ServoCalibration(driver, plugs.camera, seen_by, config.target, config.cards, config.seed, config.postures)
         for arm, name in enumerate(ARMS):
-            measured = procedure.arm(arm)
-            path = config.folder() / f"{name}.json"
-            measured.calibration.save(path)
-            half_us[name] = measured.half_band_us
+            found[name] = measured = procedure.arm(arm)
             print(
-                f"{name} arm: seen in {measured.sightings} postures, {measured.residual_mm:.2f} mm off, dead band "
-                f"{2 * measured.half_band_us:.1f} us, {_change(driver.calibrations[arm], measured.calibration)} -> {path}"
+                f"{name} arm: seen in {measured.sightings} postures, {measured.residual_mm:.2f} mm off, {_bands(measured)}, "
+                f"{_sure(measured)}, {_change(driver.calibrations[arm], measured.calibration)}"
             )
-    save_play(Path(config.folder()), half_us)
+            _require_good(name, measured, config.worst_mm)
+    save_servos(
+        config.folder(),
+        {name: measured.calibration for name, measured in found.items()},
+        {name: measured.half_band_us for name, measured in found.items()},
+        {name: measured.half_band_sd_us for name, measured in found.items()},
+    )
+    print(f"-> {config.folder()}")
     assistant.take_cards_off()
+
+
+def _require_good(name: str, measured: Measured, worst_mm: float) -> None:
+    """Refuse a calibration that explains little; say so of one that explains less than it should."""
+    from marl_handover.hardware.calibration import CalibrationProblem
+
+    off = f"{measured.residual_mm:.2f} mm off"
+    if not measured.residual_mm <= worst_mm:
+        raise CalibrationProblem(f"the {name} arm", f"{off}, more than worst_mm={worst_mm:g}, so nothing was saved; {_SUSPECTS}")
+    if measured.residual_mm > DOUBTFUL_MM:
+        print(f"{name} arm: WARNING, {off} where {DOUBTFUL_MM:g} mm are usual at most; {_SUSPECTS}")
+
+
+def _sure(measured: Measured) -> str:
+    """Each joint's standard deviation."""
+    joints = zip(ARM_JOINTS, measured.joint_sd_deg, strict=True)
+    return "sure to within degrees: " + " ".join(f"{joint} {sd_deg:.2f}" for joint, sd_deg in joints)
+
+
+def _bands(measured: Measured) -> str:
+    """The dead bands, each with the half-width of the interval it is in with 95 %."""
+    bands = zip(ARM_JOINTS, 2 * measured.half_band_us, 4 * measured.half_band_sd_us, strict=True)
+    return "dead bands in us: " + " ".join(f"{joint} {width:.1f} +- {sure:.1f}" for joint, width, sure in bands)
 
 
 def _change(before: ArmCalibration, after: ArmCalibration) -> str:

@@ -54,7 +54,10 @@ CORE, EXTRAS = _wanted()
 
 @dataclass
 class DoctorConfig:
-    """The doctor takes no keys."""
+    """Keys of ``doctor``."""
+
+    ask: bool = False  # open every port that looks like a controller's, and ask who is there; nothing moves
+    port: str = ""  # ask at this one as well, whatever it looks like
 
 
 SCHEMA: type = DoctorConfig
@@ -71,7 +74,8 @@ def run(config: DoctorConfig) -> int:
         "devices": _devices(),
         "compiler": _compiler(),
         "cameras": _listed("/dev", "video*", "none found"),
-        "serial ports": _listed("/dev/serial/by-id", "*", "none found"),
+        "serial ports": _ports(config),
+        "arms": _arms(),
         "extras": _extras(),
     }
     for title, lines in sections.items():
@@ -136,10 +140,69 @@ def _listed(folder: str, pattern: str, otherwise: str) -> Iterator[str]:
     if not found:
         yield otherwise
     for path in found:
-        access = (
-            "" if os.access(path, os.R_OK | os.W_OK) else f"  (no permission; run: sudo usermod -aG {_group(path)} $USER, and log in again)"
-        )
-        yield f"{path}{access}"
+        yield f"{path}{_access(path)}"
+
+
+def _access(path: Path) -> str:
+    if os.access(path, os.R_OK | os.W_OK):
+        return ""
+    return f"  (no permission; run: sudo usermod -aG {_group(path)} $USER, and log in again)"
+
+
+def _ports(config: DoctorConfig) -> Iterator[str]:
+    """Ports by their lasting names; who is at them only if that is asked for: opening a port resets some devices."""
+    try:
+        from marl_handover.hardware.ports import latency_ms, list_serial_ports
+    except ImportError as error:
+        yield f"cannot be listed: {error}"
+        return
+    ports = list_serial_ports()
+    if not ports:
+        yield "none found"
+    for port in ports:
+        latency = latency_ms(port.path)
+        timer = "" if latency is None else f", hands bytes over after {latency} ms"
+        kind = ", may be a controller" if port.likely else ""
+        yield f"{port.path}  {port.description}{kind}{timer}{_access(Path(port.path))}"
+        if config.ask and port.likely and port.path != config.port:
+            yield f"  {_who(port.path)}"
+    if config.port:
+        yield f"{config.port}: {_who(config.port)}"
+    elif any(port.likely for port in ports) and not config.ask:
+        yield "who is there, and at which rate: marl-handover doctor ask=true"
+
+
+def _who(port: str) -> str:
+    """What the controller at a port says that it is, or why it says nothing."""
+    from marl_handover.hardware.clock import RealClock
+    from marl_handover.hardware.errors import DeviceError
+    from marl_handover.hardware.settings import BoardConfig, TimeoutConfig
+    from marl_handover.hardware.ssc32 import Ssc32
+
+    board = Ssc32("asked", BoardConfig(port), TimeoutConfig(), RealClock())
+    try:
+        firmware, best = board.connect().text, BoardConfig().baud
+        slow = "" if board.wire.baud == best else f"; too slow to stop two arms in time: set the board to {best}, see docs/hardware.md"
+        return f"{firmware} at {board.wire.baud} baud{slow}"
+    except DeviceError as error:
+        return str(error)
+    finally:
+        board.close()
+
+
+def _arms() -> Iterator[str]:
+    """The latched stop, and which sessions could move arms now."""
+    from marl_handover.hardware.latch import StopLatch
+    from marl_handover.hardware.roll import Roll
+    from marl_handover.hardware.settings import HardwareConfig
+
+    latch = StopLatch(HardwareConfig().stop_path())
+    if latch.is_set():
+        yield f"the stop is latched ({latch.reason()}), so nothing moves; allow motion again: marl-handover stop clear=true"
+    else:
+        yield "no stop is latched"
+    running = Roll().signed()
+    yield f"sessions that run: {', '.join(f'process {session.pid}' for session in running) or 'none'}"
 
 
 def _group(path: Path) -> str:

@@ -25,6 +25,12 @@ def confirmed(question: str) -> bool:
     return input(f"{question} Type yes: ").strip().lower() == "yes"
 
 
+def laid_anew() -> None:
+    """Wait until somebody has laid block and goal for the next episode. Without a terminal: they stay as they are."""
+    if sys.stdin.isatty():
+        input("lay the block, and the goal's marker, where the next episode is to find them, hands off the table; then press Enter ")
+
+
 class Person:
     """Does what :class:`~marl_handover.runtime.camera_calibration.Assistant` asks, after Enter was pressed."""
 

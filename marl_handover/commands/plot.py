@@ -1,4 +1,4 @@
-"""``marl-handover plot``: a figure of training runs, of a cell, of a plan or of an evaluation."""
+"""``marl-handover plot``: a figure of training runs, of a cell, of a plan, of its motions, of an evaluation, of a suite."""
 
 from __future__ import annotations
 
@@ -8,26 +8,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from marl_handover.config import CellConfig, require_choice
-from marl_handover.errors import CorruptFile, InvalidSetting
+from marl_handover.config import CellConfig, MotionConfig, require_at_least, require_choice
+from marl_handover.errors import CorruptFile, InvalidSetting, UnknownChoice
 
 Figure = Any
 """matplotlib's, which only :mod:`marl_handover.report` imports."""
 
-KINDS = ("run", "workspace", "plan", "evaluation")
+KINDS = ("run", "workspace", "plan", "motion", "evaluation", "errors", "confusion", "compare")
+WROTE = {"plan": "plan json=FILE", "motion": "plan motion=FILE", "evaluation": "evaluate json=FILE"}
+"""Which command wrote the json file of a kind."""
 
 
 @dataclass
 class PlotConfig:
     """Keys of ``plot``."""
 
-    kind: str = "run"  # run, workspace, plan or evaluation
+    kind: str = "run"  # run, workspace, plan, motion, evaluation, errors, confusion or compare
     run: str = ""  # kind=run: a run directory, or several seeds: [A,B]
-    json: str = ""  # kind=plan, kind=evaluation: what that command wrote with json=FILE
-    trace: str = ""  # kind=evaluation: its trace=FILE, for a histogram of transfers
+    json: str = ""  # kind=plan, motion, evaluation: what that command wrote with json=FILE or motion=FILE
+    trace: str = ""  # kind=errors, confusion: trace=FILE of evaluate; of confusion also two, [A,B]; kind=evaluation: adds a histogram
+    suite: str = ""  # kind=compare: folder of a suite that compare wrote
+    figure: str = ""  # kind=compare: one of its figures; all if empty
+    scale: str = "log"  # kind=errors: log or linear
     symmetry_order: int = 1  # of the block in the trace
-    cell: CellConfig | None = None  # null: the plan's own, or paper
-    out: str = ""  # .png, .pdf or .svg; learning.png in the run directory, or beside the json file
+    cell: CellConfig | None = None  # null: the file's own, or paper
+    out: str = ""  # .png, .pdf or .svg; learning.png in the run directory, or beside the file; of a whole suite: a folder
 
 
 SCHEMA: type = PlotConfig
@@ -36,13 +41,26 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 
 def run(config: PlotConfig) -> int:
-    """Draw one figure and say where it is."""
+    """Draw one figure, or those of a suite, and say where it is."""
     from marl_handover.report.files import require_picture, save_figure
 
     require_choice("kind", config.kind, KINDS)
-    if config.out:
+    require_at_least("symmetry_order", config.symmetry_order, 1)
+    whole_suite = config.kind == "compare" and not config.figure
+    if config.out and not whole_suite:
         require_picture("out", config.out)
-    makers = {"run": _run, "workspace": _workspace, "plan": _plan, "evaluation": _evaluation}
+    if whole_suite:
+        return _whole_suite(config)
+    makers = {
+        "run": _run,
+        "workspace": _workspace,
+        "plan": _plan,
+        "motion": _motion,
+        "evaluation": _evaluation,
+        "errors": _errors,
+        "confusion": _confusion,
+        "compare": _suite_figure,
+    }
     figure, default = makers[config.kind](config)
     out = Path(config.out) if config.out else default
     save_figure(figure, out)
@@ -52,12 +70,16 @@ def run(config: PlotConfig) -> int:
 
 def run_folders(text: str) -> list[Path]:
     """The run directories of ``run=DIR`` or ``run=[A,B]``; ``run`` is text, as a path may hold what means something in Hydra's grammar."""
-    inner = text[1:-1] if text.startswith("[") and text.endswith("]") else None
-    names = [text] if inner is None else inner.split(",")
-    folders = [Path(name.strip().strip("'\"")) for name in names if name.strip()]
+    folders = _paths(text)
     if not folders:
         raise InvalidSetting("run", text, "a run directory, run=DIR, or several, run=[A,B]")
     return folders
+
+
+def _paths(text: str) -> list[Path]:
+    inner = text[1:-1] if text.startswith("[") and text.endswith("]") else None
+    names = [text] if inner is None else inner.split(",")
+    return [Path(name.strip().strip("'\"")) for name in names if name.strip()]
 
 
 def _run(config: PlotConfig) -> tuple[Figure, Path]:
@@ -82,25 +104,35 @@ def _plan(config: PlotConfig) -> tuple[Figure, Path]:
     from marl_handover.cell import load_cell
     from marl_handover.report.plan import check_plan, plan_figure
 
-    path, plan = _json(config, "plan")
+    path, plan = _json(config)
     check_plan(plan, path)
-    settings = config.cell if config.cell is not None else _stored_cell(plan, path)
-    return plan_figure(plan, load_cell(settings)), path.with_suffix(".png")
+    if config.cell is None and "cell_settings" not in plan:
+        raise CorruptFile("plan", path, "it lacks 'cell_settings'; name the cell: cell=paper")
+    return plan_figure(plan, load_cell(config.cell or _stored(CellConfig, plan, "cell_settings", path))), path.with_suffix(".png")
 
 
-def _stored_cell(plan: dict[str, Any], path: Path) -> CellConfig:
+def _motion(config: PlotConfig) -> tuple[Figure, Path]:
+    from marl_handover.cell import build_cell
+    from marl_handover.report.motion import motion_figure, read_motions, require_fit
+
+    path, content = _json(config)
+    motions = read_motions(content, path)
+    model = build_cell(config.cell or _stored(CellConfig, content, "cell_settings", path))
+    require_fit(motions, model)
+    return motion_figure(motions, model, _stored(MotionConfig, content, "motion_settings", path)), path.with_suffix(".png")
+
+
+def _stored(schema: type, content: dict[str, Any], key: str, path: Path) -> Any:
+    """The settings that a file holds under ``key``; the defaults if it has none."""
     from marl_handover.compose import from_text
 
-    if not isinstance(plan.get("cell_settings"), dict):
-        raise CorruptFile("plan", path, "it lacks 'cell_settings'; name the cell: cell=paper")
-    settings: CellConfig = from_text(CellConfig, json.dumps(plan["cell_settings"]), path)
-    return settings
+    return from_text(schema, json.dumps(content.get(key, {})), path)
 
 
 def _evaluation(config: PlotConfig) -> tuple[Figure, Path]:
     from marl_handover.report.evaluation import check_evaluation, evaluation_figure
 
-    path, result = _json(config, "evaluation")
+    path, result = _json(config)
     check_evaluation(result, path)
     counts = _transfers(config, result) if config.trace else (None, None)
     return evaluation_figure(result, *counts), path.with_suffix(".png")
@@ -108,31 +140,107 @@ def _evaluation(config: PlotConfig) -> tuple[Figure, Path]:
 
 def _transfers(config: PlotConfig, result: dict[str, Any]) -> tuple[Any, Any]:
     """Transfers and optimal transfers of each successful episode of the trace, int (n,)."""
+    from marl_handover.report.traces import as_seen, read_trace
+    from marl_handover.task.planner import ExactPlanner
+
+    trace = read_trace(Path(config.trace))
+    played = trace.take(trace.solved)
+    wanted = result["outcomes"]["success"]
+    # A simulated cell knows better than the loop whether the block is at the goal, so there the trace may differ.
+    if len(played.episode) != wanted and result.get("backend", "kinematic") == "kinematic":
+        raise InvalidSetting(
+            "trace", config.trace, f"of the same evaluation; it has {len(played.episode)} successes, the json file {wanted}"
+        )
+    rules = _rules(config, played, epsilon_deg=float(result["epsilon_deg"]))
+    return played.transfers, ExactPlanner(rules).plan(as_seen(rules.cell, played.start), played.goal).transfers
+
+
+def _errors(config: PlotConfig) -> tuple[Figure, Path]:
+    from marl_handover.report.errors import SCALES, errors_figure
+
+    require_choice("scale", config.scale, SCALES)
+    path, trace = _traces(config, 1)[0]
+    return errors_figure(trace, config.symmetry_order, config.scale, path.stem), path.with_name(f"{path.stem}_errors.png")
+
+
+def _confusion(config: PlotConfig) -> tuple[Figure, Path]:
+    from marl_handover.report.confusion import endings_against, meant_figure
+
+    (path, trace), *more = _traces(config, 2)
+    default = path.with_name(f"{path.stem}_confusion.png")
+    if more:
+        return endings_against(trace, more[0][1], (path.stem, more[0][0].stem)), default
+    return meant_figure(trace, _rules(config, trace), path.stem), default
+
+
+def _traces(config: PlotConfig, most: int) -> list[tuple[Path, Any]]:
+    from marl_handover.report.traces import read_trace
+
+    paths = _paths(config.trace)
+    if not 1 <= len(paths) <= most:
+        more = "" if most == 1 else ", or two of the same problems, trace=[A,B]"
+        raise InvalidSetting("trace", config.trace, f"a file that `marl-handover evaluate trace=FILE` wrote{more}")
+    return [(path, read_trace(path)) for path in paths]
+
+
+def _rules(config: PlotConfig, trace: Any, epsilon_deg: float = 5.0) -> Any:
+    """The rule book of the trace's cell. Raises :class:`InvalidSetting` for a cell in which nobody reaches its problems."""
     from marl_handover.cell import load_cell
     from marl_handover.config import TaskConfig
-    from marl_handover.report.evaluation import read_trace
-    from marl_handover.task.planner import ExactPlanner
+    from marl_handover.report.traces import as_seen
     from marl_handover.task.rules import Rules
 
-    played = read_trace(Path(config.trace))
-    if len(played.transfers) != result["outcomes"]["success"]:
-        raise InvalidSetting(
-            "trace",
-            config.trace,
-            f"of the same evaluation; it has {len(played.transfers)} successes, the json file {result['outcomes']['success']}",
-        )
     cell = load_cell(config.cell or CellConfig())
-    if not (cell.reaches(played.start).any(-1) & cell.reaches(played.goal).any(-1)).all():
+    if not (cell.reaches(as_seen(cell, trace.start)).any(-1) & cell.reaches(trace.goal).any(-1)).all():
         raise InvalidSetting("cell", cell.config.name, "the cell of the trace; some of its episodes are out of this one's reach")
-    planner = ExactPlanner(Rules(cell, TaskConfig(epsilon_deg=float(result["epsilon_deg"]), symmetry_order=config.symmetry_order)))
-    return played.transfers, planner.plan(played.start, played.goal).transfers
+    return Rules(cell, TaskConfig(epsilon_deg=epsilon_deg, symmetry_order=config.symmetry_order))
 
 
-def _json(config: PlotConfig, what: str) -> tuple[Path, dict[str, Any]]:
+def _suite_figure(config: PlotConfig) -> tuple[Figure, Path]:
+    folder, figures = _suite(config)
+    if config.figure not in figures:
+        raise UnknownChoice("figure", config.figure, figures)
+    if figures[config.figure] is None:
+        raise InvalidSetting("figure", config.figure, "one that has values already; this suite has none for it yet")
+    return figures[config.figure], folder / "figures" / f"{config.figure}.png"
+
+
+def _whole_suite(config: PlotConfig) -> int:
+    """All figures of a suite, each as PNG and PDF."""
+    from marl_handover.report.files import save_figure
+
+    folder, figures = _suite(config)
+    out = Path(config.out) if config.out else folder / "figures"
+    for name, figure in figures.items():
+        if figure is None:
+            print(f"no values yet: {name}")
+            continue
+        for suffix in ("png", "pdf"):
+            save_figure(figure, out / f"{name}.{suffix}")
+        print(f"written: {out / name}.png, .pdf")
+    return 0
+
+
+def _suite(config: PlotConfig) -> tuple[Path, dict[str, Figure | None]]:
+    """Folder and figures of a suite, from its stored numbers alone."""
+    from marl_handover.report.compare import make_figures
+    from marl_handover.report.files import read_json
+
+    if not config.suite:
+        raise InvalidSetting("suite", config.suite, "a folder that `marl-handover compare` wrote, such as runs/compare/paper")
+    folder = Path(config.suite)
+    path = folder / "results.json"
+    results = read_json(path, "results of a suite")
+    try:
+        return folder, dict(make_figures(results))
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise CorruptFile("results of a suite", path, f"{type(error).__name__}: {error}") from error
+
+
+def _json(config: PlotConfig) -> tuple[Path, dict[str, Any]]:
     from marl_handover.report.files import read_json
 
     if not config.json:
-        command = {"plan": "plan", "evaluation": "evaluate"}[what]
-        raise InvalidSetting("json", config.json, f"the file that `marl-handover {command} json=FILE` wrote")
+        raise InvalidSetting("json", config.json, f"the file that `marl-handover {WROTE[config.kind]}` wrote")
     path = Path(config.json)
-    return path, read_json(path, what)
+    return path, read_json(path, config.kind)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover import policies
-from marl_handover.commands.person import confirmed
+from marl_handover.commands.person import confirmed, laid_anew
 from marl_handover.config import CellConfig, LoopConfig, MotionConfig, TaskChanges, require_at_least, require_seed
 from marl_handover.errors import InvalidSetting, MissingFile, OutOfReach
 from marl_handover.runtime.settings import LabConfig
@@ -31,13 +31,17 @@ class RunCommand(LabConfig):
     """Settings of ``run``."""
 
     policy: str = "pretrained_b"  # exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
-    episodes: int = 1
+    episodes: int = 1  # of a real cell with a terminal: before each but the first somebody lays the block anew and presses Enter
     seed: int = 0  # of the twin's problems
     start: list[float] | None = None  # of the twin's block: x [mm], y [mm], orientation [deg]; null: random
     goal: list[float] | None = None  # the same; null: of the twin random, of a real cell the printed marker
     printed: bool = False  # of the twin: the goal is a printed marker that the camera has to see
     dry_run: bool = False  # everything but the last write: nothing moves
     log: str = ""  # file for every event, JSON Lines
+    publish: str = ""  # folder in which the session shows itself to marl-handover view live=FOLDER; empty: it does not
+    view_control: bool = False  # whether that folder's pages may pause the session and give it goals; they may always stop it
+    paused: bool = False  # with view_control: nothing moves before somebody presses start
+    real_time: bool = False  # of the twin: no faster than the arms would be
     cell: CellConfig | None = None  # single keys change the paper cell
     task: TaskChanges = field(default_factory=TaskChanges)
     motion: MotionConfig = field(default_factory=MotionConfig)
@@ -52,15 +56,26 @@ GROUPS: dict[str, dict[str, type]] = {}
 def run(config: RunCommand) -> int:
     """Play and print. 0 if every episode ended at its goal, else 1."""
     from marl_handover.runtime.loop import make_loop
+    from marl_handover.runtime.pace import keep_pace
+    from marl_handover.runtime.publishing import Publisher
     from marl_handover.runtime.session import Session
 
     _check(config)
     policy = policies.adapted(config.policy, config.cell, config.seed, motion=config.motion, **vars(config.task))
     options: dict[str, Any] = {"config": config, "confirm": confirmed, "dry_run": config.dry_run, "log_path": config.log}
-    with make_loop(policy, "hardware", config.motion, config.loop, **options) as loop:
-        session = Session(loop, {"policy": config.policy, "hardware": config.hardware.name, "seed": config.seed, "dry_run": config.dry_run})
+    about = {"policy": config.policy, "hardware": config.hardware.name, "seed": config.seed, "dry_run": config.dry_run}
+    with (
+        Publisher(config.publish, view_control=config.view_control, paused=config.paused, log_path=config.log) as publisher,
+        make_loop(policy, "hardware", config.motion, config.loop, **options) as loop,
+    ):
+        publisher.attach(loop)
+        session = Session(loop, about, publisher.desk)
+        if config.real_time:
+            keep_pace(session.backend.clock)
         solved = 0
         for number, (start, goal) in enumerate(_problems(config, loop.rules)):
+            if number and not config.emulated:
+                laid_anew()
             begun = time.perf_counter()
             episode = _play(config, session, loop, start, goal, config.seed + number)
             solved += episode.solved
@@ -80,6 +95,10 @@ def _check(config: RunCommand) -> None:
             raise InvalidSetting(name, value, "x [mm], y [mm], orientation [deg]")
     if config.start is not None and not config.emulated:
         raise InvalidSetting("start", config.start, "left out with a real cell: its block lies where it lies")
+    if config.printed and not config.emulated:
+        raise InvalidSetting("printed", config.printed, "left out with a real cell: without goal=[x,y,deg] its goal is the printed one")
+    if config.real_time and not config.emulated:
+        raise InvalidSetting("real_time", config.real_time, "left out with a real cell: it knows no other time")
     if config.log and not Path(config.log).parent.is_dir():
         raise MissingFile("folder", Path(config.log).parent, "make it first")
 
@@ -105,14 +124,15 @@ def _pose(name: str, value: list[float] | None, rules: Rules) -> Floats | None:
 
 
 def _play(config: RunCommand, session: Session, loop: ClosedLoop, start: Floats, goal: Floats | None, seed: int) -> Episode:
-    from marl_handover.runtime.session import GivenGoal, PrintedGoal
+    from marl_handover.runtime.session import GivenGoal
 
     twin = session.backend.lab.twin
     if goal is not None and not (config.printed and twin is not None):
         return session.play(start, GivenGoal(goal), seed)
     if twin is not None:
         twin.goal = goal
-    return session.play(start, PrintedGoal(session.backend), seed)
+        session.printed.forget()
+    return session.play(start, session.printed, seed)
 
 
 def _tell(number: int, episode: Episode, wall_s: float) -> None:

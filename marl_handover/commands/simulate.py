@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from marl_handover.envs.handover_aec import HandoverEnv
     from marl_handover.motion.executor import ExecutorAgent
     from marl_handover.simulation.backend import BulletBackend
-    from marl_handover.simulation.video import Video
+    from marl_handover.simulation.film import Film
+    from marl_handover.task.rules import Rules
 
 Floats = NDArray[np.float64]
 
@@ -46,8 +47,9 @@ class SimulateCommand:
     grasp: str = "friction"  # friction, or constraint: a rigid joint while both fingers are on the pin
     video: str = ""  # .mp4 or .gif
     fps: float = 12.5  # of the video, in simulated time
-    size: list[int] = field(default_factory=lambda: [640, 360])  # of the video: width, height in pixels
+    size: list[int] = field(default_factory=lambda: [640, 480])  # of the video: width, height in pixels
     view: str = "overview"  # of the video: overview, or top (the cell's camera)
+    captions: bool = True  # of the video: transfer, arm and error below the picture, what the arms reach on the table
     gui: bool = False  # open PyBullet's window
     progress: bool = True
 
@@ -69,19 +71,21 @@ class Played(NamedTuple):
 def run(config: SimulateCommand) -> int:
     """Play, print, write. Raises :class:`WorkFailed` if an episode misses its goal."""
     from marl_handover.simulation.backend import BulletBackend
-    from marl_handover.simulation.camera import OVERVIEW, TOP
+    from marl_handover.simulation.camera import view
+    from marl_handover.simulation.film import picture_size
 
-    views = {"overview": OVERVIEW, "top": TOP}
-    width, height = _check(config, tuple(views))
+    _check(config)
+    size = picture_size((config.size[0], config.size[1]), config.captions)
     policy = policies.adapted(config.policy, config.cell, config.seed, **vars(config.task))
     policy.require_executors()
     for name in ("start", "goal"):
         _require_reach(policy.rules.cell, name, getattr(config, name))
     model = build_cell(policy.rules.cell.config)
-    backend = BulletBackend(model, config.motion, grasp=config.grasp, gui=config.gui, camera=views[config.view], size=(width, height))
+    camera = view(config.view, model.cell)
+    backend = BulletBackend(model, config.motion, grasp=config.grasp, gui=config.gui, camera=camera, size=size)
     try:
-        with _recording(config, backend) as frames:
-            played = list(_episodes(config, policy, model, backend, frames))
+        with _recording(config, backend, policy.rules) as film:
+            played = list(_episodes(config, policy, model, backend, film))
     finally:
         backend.close()
     failed = [episode.outcome for episode in played if episode.outcome != "success"]
@@ -92,19 +96,23 @@ def run(config: SimulateCommand) -> int:
     return 0
 
 
-def _check(config: SimulateCommand, views: tuple[str, ...]) -> tuple[int, int]:
-    """The video's size. Raises for settings that cannot be, before anything is built."""
+def _check(config: SimulateCommand) -> None:
+    """Raise for settings that cannot be, before anything is built."""
     from marl_handover.config import require_between, require_choice
+    from marl_handover.simulation.camera import VIEWS
+    from marl_handover.simulation.film import picture_size
     from marl_handover.simulation.video import require_video
     from marl_handover.simulation.world import GRASPS
 
     require_at_least("episodes", config.episodes, 1)
     require_seed(config.seed)
     require_choice("grasp", config.grasp, GRASPS)
-    require_choice("view", config.view, views)
+    require_choice("view", config.view, VIEWS)
     require_between("fps", config.fps, 1, 50)
     if len(config.size) != 2 or not all(16 <= side <= 4096 and side % 2 == 0 for side in config.size):
         raise InvalidSetting("size", list(config.size), "two even numbers of pixels, 16 to 4096: [width, height]")
+    if picture_size((config.size[0], config.size[1]), config.captions)[1] < 8:
+        raise InvalidSetting("size", list(config.size), "higher, to have room for the words below the picture; or captions=false")
     for name in ("start", "goal"):
         pose = getattr(config, name)
         if pose is not None and not (len(pose) == 3 and all(math.isfinite(number) for number in pose)):
@@ -114,7 +122,6 @@ def _check(config: SimulateCommand, views: tuple[str, ...]) -> tuple[int, int]:
     config.motion.validate()
     if config.video:
         require_video("video", config.video)
-    return config.size[0], config.size[1]
 
 
 def _require_reach(cell: Cell, name: str, pose: list[float] | None) -> None:
@@ -123,29 +130,21 @@ def _require_reach(cell: Cell, name: str, pose: list[float] | None) -> None:
 
 
 @contextmanager
-def _recording(config: SimulateCommand, backend: BulletBackend) -> Iterator[Video | None]:
-    """The video, if one is asked for; it gets a frame whenever one is due while arms move."""
+def _recording(config: SimulateCommand, backend: BulletBackend, rules: Rules) -> Iterator[Film | None]:
+    """The film, if a video is asked for."""
     if not config.video:
         yield None
         return
-    from marl_handover.simulation.video import FrameClock, Video
-    from marl_handover.simulation.world import CONTROL_S
+    from marl_handover.simulation.film import filming
 
-    clock = FrameClock(config.fps, CONTROL_S)
-    with Video(config.video, config.fps) as video:
-
-        def step() -> None:
-            for _ in range(clock.due()):
-                video.add(backend.render())
-
-        backend.on_step = step
-        yield video
-        video.add(backend.render())
+    size = (config.size[0], config.size[1])
+    with filming(config.video, config.fps, backend, size, config.captions, rules.orientation_error) as film:
+        yield film
     print(f"wrote {config.video}")
 
 
 def _episodes(
-    config: SimulateCommand, policy: policies.SupervisorPolicy, model: Any, backend: BulletBackend, frames: Video | None
+    config: SimulateCommand, policy: policies.SupervisorPolicy, model: Any, backend: BulletBackend, film: Film | None
 ) -> Iterator[Played]:
     from marl_handover.envs.handover_aec import raw_env
     from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
@@ -161,10 +160,15 @@ def _episodes(
     with tqdm(total=config.episodes, unit="episode", disable=hidden, leave=False) as bar:
         for episode in range(config.episodes):
             env.reset(seed=config.seed if episode == 0 else None, options=problem or None)
-            backend.cell.show_goal(env.observe("supervisor")["goal"])
-            if frames is not None:
-                frames.add(backend.render())
-            yield play(env, supervisor, arms, backend, lambda line: bar.write(line))
+            goal = env.observe("supervisor")["goal"]
+            if film is None:
+                backend.cell.show_goal(goal)
+            else:
+                film.begin(goal)
+            played = play(env, supervisor, arms, backend, lambda line: bar.write(line), film)
+            if film is not None:
+                film.end(played.outcome)
+            yield played
             bar.update()
 
 
@@ -174,8 +178,9 @@ def play(
     arms: dict[str, ExecutorAgent],
     backend: BulletBackend,
     say: Callable[[str], None],
+    film: Film | None = None,
 ) -> Played:
-    """Play one episode from where ``env`` was reset to; ``say`` gets one line a transfer."""
+    """Play one episode from where ``env`` was reset to; ``say`` gets one line a transfer, ``film`` is told whose turn it is."""
     simulated, began, stopped = 0.0, time.perf_counter(), False
     goal = env.observe("supervisor")["goal"]
     say(f"object {_pose(backend.cell.object_pose())} to goal {_pose(goal)}")
@@ -190,6 +195,8 @@ def play(
                 stopped = True
                 break
             continue
+        if film is not None:
+            film.turn(arms[agent].arm, bool(observation["final"]))
         started, backend.last = time.perf_counter(), None
         action = arms[agent].act(observation)
         env.step(action)

@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from marl_handover.config import require_at_least
+from marl_handover.errors import InvalidSetting, WorkFailed
 from marl_handover.hardware.settings import HardwareConfig
 
 if TYPE_CHECKING:
     from marl_handover.hardware.latch import StopLatch
+    from marl_handover.hardware.roll import Roll, Signed
 
 _POLL_S = 0.01
+POWER = "if arms move, CUT THE POWER"
+
+
+class NotStopped(WorkFailed):
+    """A stop that did not reach everybody."""
+
+    def __init__(self, troubles: Sequence[str]) -> None:
+        super().__init__(f"{'; '.join(troubles)}: {POWER}")
 
 
 @dataclass
@@ -21,8 +33,8 @@ class StopCommand:
 
     reason: str = "marl-handover stop"  # is shown by whoever is stopped
     clear: bool = False  # allow motion again; nothing moves by itself
-    wait_s: float = 1.0  # for a session to say that it has stopped
-    hardware: HardwareConfig = field(default_factory=HardwareConfig)  # its stop_file
+    wait_s: float = 1.0  # for every session to say that it has stopped
+    hardware: HardwareConfig = field(default_factory=HardwareConfig)  # with a stop_file: stop only what looks at that one
 
 
 SCHEMA: type = StopCommand
@@ -31,26 +43,57 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 
 def run(config: StopCommand) -> int:
-    """Latch the stop, or clear it; 0 either way: the stop holds for sessions to come as well."""
+    """Latch the stop, or clear it. 0 if every session that runs has stopped, also if there is none: the stop holds for those to come.
+
+    Raises:
+        NotStopped: a session did not answer in time, or a stop file cannot be written.
+    """
     from marl_handover.hardware.latch import StopLatch
+    from marl_handover.hardware.roll import Roll
 
     require_at_least("wait_s", config.wait_s, 0)
-    latch = StopLatch(config.hardware.stop_path())
+    given, roll = config.hardware.stop_file, Roll()
+    path = Path(config.hardware.stop_path())
+    if given and not path.is_absolute():
+        raise InvalidSetting("hardware.stop_file", given, "an absolute path")
+    running = roll.signed(path if given else None)
+    paths = list(dict.fromkeys([path, *(session.stop_file for session in running)]))
     if config.clear:
-        latch.clear()
-        print(f"cleared {latch.path}; arms may move again")
+        for each in paths:
+            StopLatch(each).clear()
+            print(f"cleared {each}; arms may move again")
         return 0
-    latch.latch(config.reason)
-    pid = _obeyed(latch, config.wait_s)
-    said = f"process {pid} has stopped its arms" if pid is not None else "no running session answered: if arms move, CUT THE POWER"
-    print(f"stop latched in {latch.path}; {said}; allow motion again: marl-handover stop clear=true")
+    troubles = [trouble for each in paths if (trouble := _latched(StopLatch(each), config.reason))]
+    troubles += _wait(roll, running, config.wait_s)
+    if troubles:
+        raise NotStopped(troubles)
+    if not running:
+        print(f"no session runs; {POWER}")
+    print("allow motion again: marl-handover stop clear=true")
     return 0
 
 
-def _obeyed(latch: StopLatch, wait_s: float) -> int | None:
+def _latched(latch: StopLatch, reason: str) -> str:
+    """Latch; what went wrong, empty if nothing did."""
+    try:
+        latch.latch(reason)
+    except OSError as error:
+        return f"the stop file {latch.path} cannot be written ({error.strerror or error})"
+    print(f"stop latched in {latch.path}", flush=True)
+    return ""
+
+
+def _wait(roll: Roll, running: Sequence[Signed], wait_s: float) -> list[str]:
+    """Wait until all have obeyed or signed off; what is wrong with those that have not."""
+    waiting = {session.entry: session.pid for session in running}
     end_s = time.monotonic() + wait_s
     while True:
-        pid = latch.obeyed_by()
-        if pid is not None or time.monotonic() >= end_s:
-            return pid
+        now = {session.entry: session.obeyed for session in roll.signed()}
+        for entry in [entry for entry in waiting if now.get(entry, True)]:
+            what = "has stopped its arms" if entry in now else "is over"
+            print(f"process {waiting.pop(entry)} {what}", flush=True)
+        if not waiting:
+            return []
+        if time.monotonic() >= end_s:
+            return [f"process {pid} did not answer within {wait_s:g} s" for pid in waiting.values()]
         time.sleep(_POLL_S)

@@ -48,6 +48,8 @@ class Refusal(StrEnum):
     MISSED_GRASP = "missed_grasp"
     DROPPED = "dropped"
     TIPPED = "tipped"
+    UNSEEN = "unseen"  # nobody knows where the object is: it does not show itself
+    STALLED = "stalled"  # the arm does nothing, time and again
 
 
 FAILURES = frozenset({Refusal.MISSED_GRASP, Refusal.DROPPED})

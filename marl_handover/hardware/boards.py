@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from marl_handover.hardware.clock import Clock
-from marl_handover.hardware.errors import BadReply, PortLost, WrongState
+from marl_handover.hardware.errors import BadReply, PortLost, TooSlow, WrongState
+from marl_handover.hardware.protocol import PULSE_US, SPEED_US_S, TIME_MS, group_move, stop
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.hardware.ssc32 import SentLine, Ssc32
+from marl_handover.hardware.transport import BITS_PER_BYTE
 from marl_handover.hardware.wiring import board_channels
 
 PULSE_TOLERANCE_US = 15
 """A pulse read back, to 10 us, may be off by this much from the one sent."""
+
+STOP_WITHIN_S = 0.04
+"""From the stop being latched to its last byte at a board, at worst."""
 
 PulsesOfBoards = Mapping[str, Mapping[int, int]]
 """Board -> channel -> pulse in us."""
@@ -26,12 +31,16 @@ class Boards:
             for name in config.used_boards()
         }
         self._channels = {name: board_channels(config, name) for name in self.by_name}
+        self._look_s = config.stream.poll_s + config.stream.backlog_s
 
     def connect(self) -> None:
-        """Connect all. Raises as :meth:`Ssc32.connect`; then none is left open."""
+        """Connect all. Raises as :meth:`Ssc32.connect`, and :class:`TooSlow`; then none is left open."""
         try:
-            for board in self.by_name.values():
+            for name, board in self.by_name.items():
                 board.connect()
+                takes_s = self.stop_s(name, board.wire.baud)
+                if takes_s > STOP_WITHIN_S:
+                    raise TooSlow(name, board.wire.baud, takes_s, STOP_WITHIN_S)
         except BaseException:
             self.close()
             raise
@@ -40,6 +49,12 @@ class Boards:
         """Let all ports go."""
         for board in self.by_name.values():
             board.close()
+
+    def stop_s(self, name: str, baud: int) -> float:
+        """How long a stop takes at worst to reach the last channel of a board: it is noticed late, and waits for the longest line."""
+        channels = self._channels[name]
+        longest = group_move(dict.fromkeys(channels, PULSE_US[1]), TIME_MS[1], dict.fromkeys(channels, SPEED_US_S[1]))
+        return self._look_s + (len(longest) + len(stop(channels))) * BITS_PER_BYTE / baud
 
     def pulses(self) -> dict[str, dict[int, int | None]]:
         """What all wired channels put out; None: no pulse, and so no known position."""
@@ -77,7 +92,7 @@ class Boards:
         return reached
 
     def limp(self) -> None:
-        """No more pulses on any channel. Raises :class:`PortLost`, after all boards were tried."""
+        """No more pulses on any channel, but for a dry run. Raises :class:`PortLost`, after all boards were tried."""
         lost: PortLost | None = None
         for name, board in self.by_name.items():
             try:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from marl_handover.cell.kinematics import ArmModel
 from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import require_choice
 from marl_handover.errors import CorruptFile, HandoverError, InvalidSetting, MissingFile
-from marl_handover.files import write_whole
+from marl_handover.files import keep, write_whole
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 
 Floats = NDArray[np.float64]
@@ -130,12 +129,9 @@ class ArmCalibration:
         Raises :class:`InvalidSetting` if it cannot be written.
         """
         path = Path(path)
-        backup = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if path.exists():
-                backup = _free_name(path)
-                shutil.copy2(path, backup)
+            backup = keep(path)
             write_whole(path, json.dumps(self._content(), indent=2, allow_nan=False) + "\n")
         except OSError as error:
             raise InvalidSetting("calibration", str(path), f"a file that can be written ({error.strerror or error})") from error
@@ -223,13 +219,6 @@ def _limits(model: ArmModel) -> tuple[tuple[float, float], ...]:
 def _require_joints(arm: str, entries: Mapping[str, Any]) -> None:
     if set(entries) != set(ARM_JOINTS):
         raise CalibrationProblem(arm, f"joints are {sorted(entries)}, wanted {sorted(ARM_JOINTS)}")
-
-
-def _free_name(path: Path) -> Path:
-    """A name for a backup that no other has."""
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    names = [path.with_name(f"{path.name}.{stamp}{suffix}.bak") for suffix in ("", *(f".{n}" for n in range(1, 1000)))]
-    return next(name for name in names if not name.exists())
 
 
 def _interpolate(x: Floats, xs: Floats, ys: Floats) -> Floats:

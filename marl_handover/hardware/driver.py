@@ -11,39 +11,39 @@ a supply that is too weak. A power switch in reach is no luxury: software cannot
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.hardware.clock import Clock
-from marl_handover.hardware.errors import NotConfirmed, Stopped, WrongState
+from marl_handover.hardware.errors import HalfHeld, NotConfirmed, WrongState
 from marl_handover.hardware.gate import JointCommand
+from marl_handover.hardware.held import Pulses, all_held, middles, none_held
 from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.session import BoardSession, State
+from marl_handover.hardware.moving import MovingSession, Sent
+from marl_handover.hardware.session import State
 from marl_handover.hardware.settings import ARMS, HardwareConfig
-from marl_handover.hardware.ssc32 import SentLine
 
-Floats = NDArray[np.float64]
+_RESTATED_S = 0.2
+"""Time for moves of half a reading, to where arms are held already."""
 
-_FULL_TURN_DEG = 180.0
-_Pulses = Mapping[str, Mapping[int, int | None]]
+_DRIVE = "The boards hold the arms. They will be driven slowly to the parked pose: is the way free, and a hand at the power switch?"
+_LET_GO = (
+    "A board has forgotten some servos while others are held. All will be let go: the arms sink. Are hands under them, or may they sink?"
+)
+_JUMP = (
+    "A board does not know where its arms are: its first move is a jump at full speed. Are both arms standing in the parked pose, "
+    "upright and drawn in, with the table free and a hand at the power switch?"
+)
+_NOMINAL = " NOT CALIBRATED: {}. With a horn one tooth off, 15 degrees, an arm jumps by that much: stay clear until it has moved."
 
 
-class Sent(NamedTuple):
-    """What went out: the lines, and the joints (5,) of each arm that their pulses, whole microseconds, stand for."""
-
-    lines: tuple[SentLine, ...]
-    joints_rad: dict[int, Floats]
-    duration_s: float
-
-
-class ArmDriver(BoardSession):
+class ArmDriver(MovingSession):
     """The arms of a cell.
 
     Args:
@@ -54,7 +54,7 @@ class ArmDriver(BoardSession):
         latch: the stop; the one of the settings unless given.
         confirm: is asked, with a text, before the first move, and says whether the arms are where the text says. None: nobody is asked,
             and so nothing moves.
-        dry_run: everything but the last write: boards are asked, never told to move. Stops and letting go are written all the same.
+        dry_run: everything but the last write: boards are asked, never told to move or to let go. Stops are written all the same.
     """
 
     def __init__(
@@ -83,86 +83,54 @@ class ArmDriver(BoardSession):
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """After an exception, Ctrl-C included, the arms are stopped where they are; else the settings say what becomes of them."""
-        if kind is not None:
-            self.halt()
-        self.disconnect()
+        self._leave(broken=kind is not None)
+
+    def disconnect(self) -> None:
+        """Let go, as the settings say: hold, limp, or park and hold. Again is fine.
+
+        If an exception is on its way the arms are stopped where they are instead.
+        """
+        self._leave(broken=sys.exc_info()[0] is not None)
 
     def arm(self) -> Sent:
         """Make the first move of every channel: to the parked pose, after somebody confirmed that this is safe. It opens the fingers.
 
-        A board that was just switched on jumps there at full speed, so that the arms have to stand there already. One that still puts out
-        pulses is driven there slowly, if the way is clear.
+        A board that was just switched on jumps there at full speed, so that the arms have to stand there already. Boards that still put
+        out pulses are driven there slowly, if the way is clear. If only some do, everything is let go first, after somebody agreed.
 
         Raises:
             NotConfirmed: nobody confirmed, or the settings refuse.
-            GateRejection: the way there is not clear; let the arms go limp and put them there.
+            GateRejection: the parked pose is not allowed, or the way there is not clear; let the arms go limp and put them there.
+            HalfHeld: only some channels have a pulse, and letting go did not help (a dry run lets nothing go).
+            Stopped: somebody stopped the arms meanwhile.
             BoardReset: a board shows no pulse even after the move.
         """
         if self.state not in (State.CONFIGURED, State.ARMED):
             raise WrongState("arm", self.state, State.CONFIGURED)
-        self.obey()
-        self.state = State.CONFIGURED
-        self.gate.forget()
         commands = [JointCommand(arm, self.parked_rad, self.motion.finger_travel_mm) for arm in range(len(ARMS))]
-        with self._watched():
-            pulses = self.boards.pulses()
-            if self._confirm is None or self.config.first_move == "refuse" or not self._confirm(_question(pulses)):
-                raise NotConfirmed()
-            duration_s = self._first_move_s(pulses)
-            wanted = self.wiring.pulses(commands)
-            self.obey()
-            sent = self.boards.first_move(wanted, round(1000 * duration_s))
-            self.wait(duration_s + self.config.stream.settle_s)
+        with self._arming():
+            self.gate.check_stand(commands)
+            pulses = self._all_or_none()
+            self._ask((_DRIVE if all_held(pulses) else _JUMP) + self._warning())
+            sent = self._jump(commands) if none_held(pulses) else self._drive_parked(commands)
             if not self.dry_run:
-                self.boards.verify(wanted)
-        for command in commands:
-            self.gate.refer(*command)
-        self.state = State.ARMED
-        return Sent(sent, self._stood_for(wanted, commands), duration_s)
+                self.boards.verify(self.wiring.pulses(commands))
+        return sent
 
-    def move(self, commands: Sequence[JointCommand], duration_s: float, made_s: float | None = None) -> Sent:
-        """Send arms somewhere together, in ``duration_s``; what was sent.
+    def rejoin(self) -> None:
+        """After a lost port: take the arms where the boards still hold them, and go on from there. Nobody has to be asked: nothing moves.
 
-        Args:
-            commands: one for each arm that is to move.
-            duration_s: a multiple of 20 ms is what boards do.
-            made_s: when the command was thought of; now unless given.
+        Every channel is sent where it is, to 10 us, which is the first move that a board wants to see after a new connection.
 
         Raises:
-            GateRejection: it must not be sent.
-            Stopped: the stop is latched; every channel was told to stop.
-            BoardReset, PortLost, BadReply: the electronics failed; the arms have to be armed again, or the port connected.
+            BoardReset: a board has forgotten its arms; they have to be armed.
+            GateRejection: it holds one outside its limits.
+            Stopped: the stop is latched, or somebody stopped the arms meanwhile.
         """
-        if self.state is State.STOPPED:
-            raise Stopped(self.latch.reason() or "earlier")
-        if self.state is not State.ARMED:
-            raise WrongState("move", self.state, State.ARMED)
-        made = self.clock.now_s() if made_s is None else made_s
-        self.obey()
-        names = self.wiring.boards(command.arm for command in commands)
-        with self._watched():
-            if self.config.stream.check_reset:
-                self.boards.require_powered(names)
-            while (backlog_s := self.boards.backlog_s(names)) > self.config.stream.backlog_s:
-                self.wait(backlog_s - self.config.stream.backlog_s)
-            self.gate.check(commands, duration_s, self.clock.now_s(), made)
-            pulses = self.wiring.pulses(commands)
-            self.obey()
-            time_ms = max(1, round(1000 * duration_s))
-            lines = [self.boards.by_name[name].move(found, time_ms, self.wiring.speeds(name, found)) for name, found in pulses.items()]
-        self.gate.accept(commands, duration_s, self.clock.now_s())
-        return Sent(tuple(lines), self._stood_for(pulses, commands), duration_s)
-
-    def joints_rad(self) -> Floats:
-        """Where the arms have been sent to by now: (num_arms, 5); NaN for arms whose position is not known. Servos say nothing."""
-        now_s = self.clock.now_s()
-        rows = [None if self._gate is None else self._gate.held(arm, now_s) for arm in range(len(ARMS))]
-        return np.array([np.full(5, np.nan) if row is None else row[0] for row in rows])
-
-    def gripper_mm(self, arm: int) -> float:
-        """How far from closed each finger of an arm has been sent; NaN if that is not known."""
-        row = None if self._gate is None else self._gate.held(arm, self.clock.now_s())
-        return math.nan if row is None else row[1]
+        if self.state is not State.CONFIGURED:
+            raise WrongState("rejoin", self.state, State.CONFIGURED)
+        with self._arming():
+            self._restate()
 
     def park(self) -> None:
         """Drive one arm after the other to the parked pose, slowly and straight in joint angles. Raises as :meth:`move`.
@@ -172,66 +140,86 @@ class ArmDriver(BoardSession):
         for arm in range(len(ARMS)):
             self.drive(arm, self.parked_rad, self.gripper_mm(arm), self.config.park_deg_s)
 
-    def drive(self, arm: int, joints_rad: Floats, gripper_mm: float, speed_deg_s: float) -> Sent:
-        """Drive one arm straight in joint angles to ``joints_rad`` (5,), none faster than ``speed_deg_s``; the last of what was sent.
+    @contextlib.contextmanager
+    def _arming(self) -> Iterator[None]:
+        """Inside, the state is arming; then armed, unless something came in between."""
+        with self._writing:
+            self.obey()
+            self.state = State.ARMING
+        try:
+            self.gate.forget()
+            with self._watched():
+                yield
+            with self._allowed(State.ARMING):
+                self.state = State.ARMED
+        finally:
+            if self.state is State.ARMING:
+                self.gate.forget()
+                self.state = State.CONFIGURED
 
-        Raises as :meth:`move`; the arm then holds where it was sent last.
-        """
-        held = self.gate.held(arm, self.clock.now_s())
-        if held is None:
-            raise WrongState("drive", "the position is not known", State.ARMED)
-        start, step_s = np.append(*held), self.config.stream.period_s
-        change = np.append(joints_rad, gripper_mm) - start
-        slowest_s = float(np.abs(np.degrees(change[:5])).max()) / speed_deg_s, abs(float(change[5])) / self.config.gate.finger_mm_s
-        steps = max(1, math.ceil(max(slowest_s) / step_s))
-        for number in range(1, steps + 1):
-            now = start + number / steps * change
-            sent = self.move([JointCommand(arm, now[:5], float(now[5]))], step_s)
-            self.wait(step_s)
+    def _all_or_none(self) -> Pulses:
+        """What the boards put out, once it is everything or nothing."""
+        pulses = self.boards.pulses()
+        if all_held(pulses) or none_held(pulses):
+            return pulses
+        if not self.dry_run:
+            self._ask(_LET_GO)
+            with self._allowed(State.ARMING):
+                self.boards.limp()
+            pulses = self.boards.pulses()
+        if not none_held(pulses):
+            raise HalfHeld()
+        return pulses
+
+    def _ask(self, question: str) -> None:
+        """Raise :class:`NotConfirmed` unless somebody says yes."""
+        if self._confirm is None or self.config.first_move == "refuse" or not self._confirm(question):
+            raise NotConfirmed()
+
+    def _warning(self) -> str:
+        """Of arms that nobody has calibrated."""
+        nominal = [calibration.arm for calibration in self.calibrations if calibration.measured_unix_s == 0.0]
+        return _NOMINAL.format(" and ".join(nominal)) if nominal else ""
+
+    def _jump(self, commands: Sequence[JointCommand]) -> Sent:
+        """The first move of boards that know no position: they jump, whatever time they are given."""
+        wanted, period_s = self.wiring.pulses(commands), self.config.stream.period_s
+        with self._allowed(State.ARMING):
+            lines = self.boards.first_move(wanted, round(1000 * period_s))
+            for command in commands:
+                self.gate.refer(*command)
+        self.wait(period_s + self.config.stream.settle_s)
+        return Sent(lines, self._stood_for(wanted, commands), period_s)
+
+    def _drive_parked(self, commands: Sequence[JointCommand]) -> Sent:
+        """From where the boards hold the arms, in short moves that the gate sees, after a look at the whole way."""
+        self._restate()
+        self.gate.check_room({command.arm: self.gate.target(command) for command in commands}, self.clock.now_s())
+        sent = self._drive(commands, self.config.park_deg_s, State.ARMING)
+        self.wait(self.config.stream.settle_s)
         return sent
 
-    def disconnect(self) -> None:
-        """Let go, as the settings say: hold, limp, or park and hold. Again is fine."""
+    def _restate(self) -> None:
+        """Send every channel where it is held, and take it for where the arms are. A joint at its limit is not sent past it."""
+        pulses = self.boards.pulses()
+        stay = self._refer(pulses)
+        wanted, within = middles(pulses), self.wiring.pulses(stay)
+        for wiring in self.config.arms.values():
+            wanted[wiring.board].update({channel: within[wiring.board][channel] for channel in wiring.channels})
+        with self._allowed(State.ARMING):
+            self.boards.first_move(wanted, round(1000 * _RESTATED_S))
+        self.wait(_RESTATED_S)
+
+    def _leave(self, broken: bool) -> None:
         try:
+            if broken:
+                self.halt()
             if self.state is State.ARMED and self.config.on_disconnect == "park":
                 self.park()
             elif self.state in (State.ARMED, State.STOPPED) and self.config.on_disconnect == "limp":
                 self.limp()
+        except BaseException:
+            self.halt()
+            raise
         finally:
             self.close()
-
-    def _first_move_s(self, pulses: _Pulses) -> float:
-        """How long to take for the first move from where the boards hold the arms. Raises :class:`GateRejection` if the way is not clear.
-
-        Channels without a pulse ignore it. Where only some have one, nobody can say how far the others' way is.
-        """
-        if _none_held(pulses):
-            return self.config.stream.period_s
-        if not _all_held(pulses):
-            return _FULL_TURN_DEG / self.config.park_deg_s
-        self.boards.require_powered(self.boards.by_name)  # asking somebody took its time
-        self._refer(pulses)
-        self.gate.check_room(dict.fromkeys(range(len(ARMS)), self.parked_rad), self.clock.now_s())
-        farthest_deg = math.degrees(float(np.abs(self.joints_rad() - self.parked_rad).max()))
-        return max(farthest_deg / self.config.park_deg_s, self.config.stream.period_s)
-
-    def _stood_for(self, pulses: Mapping[str, Mapping[int, int]], commands: Sequence[JointCommand]) -> dict[int, Floats]:
-        return {command.arm: self.wiring.state(pulses, command.arm)[0] for command in commands}
-
-
-def _all_held(pulses: _Pulses) -> bool:
-    return all(pulse is not None for found in pulses.values() for pulse in found.values())
-
-
-def _none_held(pulses: _Pulses) -> bool:
-    return all(pulse is None for found in pulses.values() for pulse in found.values())
-
-
-def _question(pulses: _Pulses) -> str:
-    """What is asked before the first move."""
-    if _all_held(pulses):
-        return "The boards hold the arms. They will be driven slowly to the parked pose: is the way free, and a hand at the power switch?"
-    return (
-        "A board does not know where its arms are: its first move is a jump at full speed. Are both arms standing in the parked pose, "
-        "upright and drawn in, with the table free and a hand at the power switch?"
-    )

@@ -102,6 +102,27 @@ class BoardReset(DeviceError):
         )
 
 
+class TooSlow(DeviceError):
+    """A board's line is too slow to stop its arms in time."""
+
+    def __init__(self, board: str, baud: int, takes_s: float, limit_s: float) -> None:
+        self.board, self.baud, self.takes_s = board, baud, takes_s
+        super().__init__(
+            f"board {board} talks at {baud} baud: a stop would take {1e3 * takes_s:.0f} ms to reach its last channel; allowed: "
+            f"{1e3 * limit_s:.0f} ms. Set it to 115200 (SSC-32U: press its button until green and red are lit; SSC-32: both baud jumpers)"
+        )
+
+
+class HalfHeld(DeviceError):
+    """Some channels have a pulse and others have none."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the boards hold some servos, and have forgotten others: those would jump at full speed while the rest is in their way. "
+            "Let all go limp, put both arms into the parked pose, and arm again"
+        )
+
+
 class NoReference(DeviceError):
     """A move was asked of a channel whose position the board does not know."""
 

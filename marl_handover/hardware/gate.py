@@ -9,6 +9,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Sequence
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -135,16 +136,12 @@ class SafetyGate:
     def check(self, commands: Sequence[JointCommand], duration_s: float, now_s: float, made_s: float) -> None:
         """Judge commands that are to be carried out together in ``duration_s`` from ``now_s``, thought of at ``made_s``.
 
-        Raises :class:`GateRejection` with the first thing that is wrong.
+        Raises :class:`GateRejection` with the first thing that is wrong. A gate that is not enabled looks at form and numbers only.
         """
+        self._check_times(duration_s, now_s, made_s)
+        targets = self._targets(commands)
         if not self.limits.enabled:
             return
-        self._check_times(duration_s, now_s - made_s)
-        targets = {command.arm: self._target(command) for command in commands}
-        if not commands or len(targets) != len(commands):
-            raise GateRejection(
-                Reason.SHAPE, None, "arms of the command", [command.arm for command in commands], "each at most once, at least one"
-            )
         for arm, target in targets.items():
             held = self._held[arm]
             if held is None:
@@ -152,6 +149,21 @@ class SafetyGate:
             self._check_ends(arm, target)
             self._check_way(arm, np.abs(target - held.at(now_s)), duration_s)
         self.check_room(targets, now_s)
+
+    def check_stand(self, commands: Sequence[JointCommand]) -> None:
+        """Judge poses of all arms as places to stand in, whatever the way there; as before a first move, whose way nobody knows.
+
+        Raises :class:`GateRejection`.
+        """
+        targets = self._targets(commands)
+        if not self.limits.enabled:
+            return
+        for arm, target in targets.items():
+            self._check_ends(arm, target)
+        swept = [targets[arm][None, :5] if arm in targets else None for arm in range(len(self._held))]
+        for arm in targets:
+            self._check_alone(arm, targets[arm][None, :5])
+            self._check_others(arm, swept, targets)
 
     def accept(self, commands: Sequence[JointCommand], duration_s: float, now_s: float) -> None:
         """Commands were sent: take them for what the arms now do."""
@@ -182,16 +194,30 @@ class SafetyGate:
                 self._check_alone(arm, Q)
                 self._check_others(arm, swept, targets)
 
-    def _check_times(self, duration_s: float, age_s: float) -> None:
+    def _check_times(self, duration_s: float, now_s: float, made_s: float) -> None:
+        for name, value in (("the duration", duration_s), ("when it was made", made_s)):
+            if not _is(value, Real):
+                raise GateRejection(Reason.SHAPE, None, name, repr(value), "a number of seconds")
         if not (math.isfinite(duration_s) and 0.0 < duration_s <= 60.0):
             raise GateRejection(Reason.DURATION, None, "the duration", duration_s, "above 0 and up to 60 s")
-        if not -_ROUNDING <= age_s <= self.limits.stale_s:
+        age_s = now_s - made_s
+        if self.limits.enabled and not -_ROUNDING <= age_s <= self.limits.stale_s:
             raise GateRejection(Reason.STALE, None, "its age", age_s, f"0 to {self.limits.stale_s:g} s")
 
-    def _target(self, command: JointCommand) -> Floats:
-        """Joints and fingers (6,)."""
-        if command.arm not in range(len(self._held)):
-            raise GateRejection(Reason.SHAPE, None, "the arm", command.arm, f"0 to {len(self._held) - 1}")
+    def _targets(self, commands: Sequence[JointCommand]) -> dict[int, Floats]:
+        """Joints and fingers (6,) by arm."""
+        found = [self.target(command) for command in commands]
+        targets = {int(command.arm): target for command, target in zip(commands, found, strict=True)}
+        if not commands or len(targets) != len(commands):
+            raise GateRejection(
+                Reason.SHAPE, None, "arms of the command", [command.arm for command in commands], "each at most once, at least one"
+            )
+        return targets
+
+    def target(self, command: JointCommand) -> Floats:
+        """Joints and fingers (6,) of a command. Raises :class:`GateRejection` if it has not the form of one, or is not finite."""
+        if not _is(command.arm, Integral) or command.arm not in range(len(self._held)):
+            raise GateRejection(Reason.SHAPE, None, "the arm", repr(command.arm), f"0 to {len(self._held) - 1}")
         try:
             target = np.append(np.asarray(command.joints_rad, float), float(command.gripper_mm))
         except (TypeError, ValueError):
@@ -254,6 +280,11 @@ class SafetyGate:
             if gap < self.limits.arm_clearance_mm:
                 limit = f"at least {self.limits.arm_clearance_mm:g} mm"
                 raise GateRejection(Reason.OTHER_ARM, arm, "the distance to the other arm on the way", gap, limit)
+
+
+def _is(value: Any, kind: type) -> bool:
+    """Whether ``value`` is a number of that kind; truth values are none."""
+    return isinstance(value, kind) and not isinstance(value, bool)
 
 
 def _swept(way: Floats, share: Floats, commanded: bool) -> Floats:

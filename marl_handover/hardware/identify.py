@@ -1,8 +1,8 @@
 """Calibrating an arm's servos from pictures: many postures, and where a camera saw a point of the hand, or a block it put down.
 
-A camera above the table sees no single joint. But the same ten numbers, zero and scale of five servos, have to explain every sighting at
-once; together with what is known beforehand (a protractor's reading, or the nominal servo) they follow from least squares. Dead bands are
-the noise: a few dozen postures, approached from both sides, average them out.
+A camera above the table sees no single joint. But the same fifteen numbers, zero, scale and dead band of five servos, have to explain
+every sighting at once; together with what is known beforehand (a protractor's reading, or the nominal servo) they follow from least
+squares. Where it is not known from which side the joints came, dead bands are noise that a few dozen postures average out.
 """
 
 from __future__ import annotations
@@ -26,6 +26,19 @@ from marl_handover.hardware.settings import ARMS
 Floats = NDArray[np.float64]
 
 LEAST_SIGHTINGS = 8
+WORST_MM = 5.0
+"""Half of the sightings may be off by this much: beyond it no servo explains them, whatever the numbers that came out."""
+
+_USUAL_US, _ARM_SD_US, _JOINT_SD_US = 4.0, 3.0, 1.5
+"""Half the dead band of a hobby servo; how far an arm's servos may be from that together, and each from the arm's others."""
+
+
+class Unexplained(CalibrationProblem):
+    """No servos explain what was seen: a camera that was knocked, a marker elsewhere or on the other hand, a loose horn."""
+
+    def __init__(self, arm: str, off_mm: float, reason: str) -> None:
+        super().__init__(arm, f"{reason}; did the camera or a marker move, is each marker on its own hand, is a horn loose?")
+        self.off_mm = off_mm
 
 
 class Sighting(NamedTuple):
@@ -33,7 +46,8 @@ class Sighting(NamedTuple):
 
     ``seen_mm`` (2,) is a world position. With a camera's place it is where the ray through the point meets the plane z = ``plane_mm``, and
     the point is ``point_mm`` (3,) of the grip's frame. Without one (NaN) it is where a block stood that the hand had put down: the grip's
-    own x and y. ``yaw_rad`` is the grip's world yaw, NaN if it was not seen.
+    own x and y. ``yaw_rad`` is the grip's world yaw, NaN if it was not seen. ``came`` says for each joint whether its pulse was rising (+1)
+    or falling (-1) when it got there, 0 if that is not known.
     """
 
     pulses_us: Floats
@@ -42,14 +56,21 @@ class Sighting(NamedTuple):
     camera_mm: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     plane_mm: float = 0.0
     point_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    came: tuple[float, ...] = (0.0,) * len(ARM_JOINTS)
 
 
 class Identified(NamedTuple):
-    """A calibration, the sightings' root mean square residual, and each joint's standard deviation in the middle of the postures."""
+    """A calibration, and how sure it is.
+
+    ``residual_mm`` is the sightings' root mean square residual, ``joint_sd_deg`` (5,) each joint's standard deviation in the middle of the
+    postures; ``half_band_us`` (5,) is half the dead band of each servo, ``half_band_sd_us`` (5,) its standard deviation.
+    """
 
     calibration: ArmCalibration
     residual_mm: float
     joint_sd_deg: Floats
+    half_band_us: Floats
+    half_band_sd_us: Floats
 
 
 def identify(
@@ -64,6 +85,8 @@ def identify(
 ) -> Identified:
     """The calibration that explains the sightings best.
 
+    The dead band of a joint that the sightings say little about comes out near the arm's other joints'.
+
     Args:
         model: the cell; its geometry is taken to be right.
         before: what was known, as lines; joints about which the sightings say nothing stay there.
@@ -74,6 +97,7 @@ def identify(
         scale_sd: how well scales were known, relative.
 
     Raises:
+        Unexplained: half of the sightings are off by more than :data:`WORST_MM`, or no best explanation was found.
         CalibrationProblem: too few sightings, or none of them finite; or what comes out is no servo.
     """
     usable = [sighting for sighting in sightings if np.isfinite(sighting.pulses_us).all() and np.isfinite(sighting.seen_mm).all()]
@@ -82,26 +106,40 @@ def identify(
     pulses = np.array([sighting.pulses_us for sighting in usable], float)
     zeros, slopes = _lines(before)
     middle = (pulses.mean(axis=0) - zeros) / slopes
-    weights = np.concatenate([np.full(5, math.radians(zero_sd_deg)), np.full(5, scale_sd)])
+    came = np.array([sighting.came for sighting in usable], float)
+    weights = np.concatenate([np.full(5, math.radians(zero_sd_deg)), np.full(5, scale_sd), [_ARM_SD_US], np.full(5, _JOINT_SD_US)])
+    halves = np.hstack([np.zeros((5, 10)), np.ones((5, 1)), np.eye(5)])  # the arm's, and how far each joint's is from it
 
     def joints(parameters: Floats) -> Floats:
         # Turned about the middle of the postures, so that zero and scale are told apart.
-        shift, stretch = parameters[:5], parameters[5:]
-        angles = (pulses - zeros) / slopes
+        shift, stretch = parameters[:5], parameters[5:10]
+        angles = (pulses - came * (_USUAL_US + halves @ parameters) - zeros) / slopes
         return middle + shift + (angles - middle) * (1.0 + stretch)
 
     def residuals(parameters: Floats) -> Floats:
         off_mm, off_rad = _misses(model, ARMS.index(before.arm), joints(parameters), usable)
         return np.concatenate([(off_mm / position_sd_mm).ravel(), off_rad / math.radians(yaw_sd_deg), parameters / weights])
 
-    found = least_squares(residuals, np.zeros(10), x_scale=weights, loss="soft_l1")
-    ends = np.stack([model.arm.lower_rad, model.arm.upper_rad])
-    at_us = zeros + slopes * (middle + (ends - middle - found.x[:5]) / (1.0 + found.x[5:]))
-    maps = [ServoMap(f"{before.arm} {joint}", list(zip(at_us[:, n], ends[:, n], strict=True))) for n, joint in enumerate(ARM_JOINTS)]
+    found = least_squares(residuals, np.zeros(len(weights)), x_scale=weights, loss="soft_l1")
     off_mm, _ = _misses(model, ARMS.index(before.arm), joints(found.x), usable)
+    _require_explained(before.arm, off_mm, found.success, found.message)
+    ends = np.stack([model.arm.lower_rad, model.arm.upper_rad])
+    at_us = zeros + slopes * (middle + (ends - middle - found.x[:5]) / (1.0 + found.x[5:10]))
+    maps = [ServoMap(f"{before.arm} {joint}", list(zip(at_us[:, n], ends[:, n], strict=True))) for n, joint in enumerate(ARM_JOINTS)]
     covariance = np.linalg.inv(found.jac.T @ found.jac)
     calibration = replace(before, maps=tuple(maps), measured_unix_s=time.time())
-    return Identified(calibration, float(np.sqrt((off_mm**2).sum(axis=1).mean())), np.degrees(np.sqrt(np.diag(covariance)[:5])))
+    residual_mm = float(np.sqrt((off_mm**2).sum(axis=1).mean()))
+    half_us, sd_us = np.maximum(_USUAL_US + halves @ found.x, 0.0), np.sqrt(np.diag(halves @ covariance @ halves.T))
+    return Identified(calibration, residual_mm, np.degrees(np.sqrt(np.diag(covariance)[:5])), half_us, sd_us)
+
+
+def _require_explained(arm: str, off_mm: Floats, success: bool, message: str) -> None:
+    """Raise :class:`Unexplained` if what was found is no explanation."""
+    half_mm = float(np.median(np.hypot(*off_mm.T)))
+    if not success:
+        raise Unexplained(arm, half_mm, f"no best explanation of what was seen was found ({message})")
+    if not half_mm <= WORST_MM:
+        raise Unexplained(arm, half_mm, f"half of the sightings are off by more than {half_mm:.1f} mm; {WORST_MM:g} mm is the limit")
 
 
 def _lines(calibration: ArmCalibration) -> tuple[Floats, Floats]:

@@ -13,6 +13,7 @@ FTDI = (0x0403, 0x6001)
 """Vendor and product of the USB chip on an SSC-32U, and in most cables of an SSC-32."""
 
 _BY_ID = Path("/dev/serial/by-id")
+_USB_SERIAL = Path("/sys/bus/usb-serial/devices")
 
 
 class PortInfo(NamedTuple):
@@ -43,3 +44,11 @@ def choose_port(port: str) -> str:
         reason = "none looks like a controller board" if not likely else "more than one could be the board"
         raise PortNotFound("", reason, [found.path for found in ports])
     return likely[0]
+
+
+def latency_ms(path: str) -> int | None:
+    """How long a USB serial chip keeps bytes back before it hands them over; None where the system does not say."""
+    try:
+        return int((_USB_SERIAL / Path(path).resolve().name / "latency_timer").read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None

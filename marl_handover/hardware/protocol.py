@@ -111,11 +111,12 @@ def group_move(pulses_us: Mapping[int, int], time_ms: int | None = None, speeds_
 def stop(channels: Iterable[int]) -> bytes:
     """Lines that stop channels where their moves are now: one short line a channel, so that the first acts while the rest is on its way.
 
-    ``Q`` goes on saying "moving" until the original time is over.
+    A fragment of a move that was cut short is dropped first: glued to it, the first stop would not be understood. (Ending the fragment's
+    line instead would carry it out.) ``Q`` goes on saying "moving" until the original time is over.
     """
     listed = list(channels)
     _require_distinct(listed)
-    return b"".join(_line(f"STOP{_channel(channel)}") for channel in listed)
+    return CANCEL + b"".join(_line(f"STOP{_channel(channel)}") for channel in listed)
 
 
 def query_pulses(channels: Sequence[int]) -> bytes:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import enum
-from collections.abc import Iterator, Mapping
-
-import numpy as np
+import threading
+from collections.abc import Iterator
 
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
@@ -14,9 +13,11 @@ from marl_handover.hardware.boards import Boards
 from marl_handover.hardware.calibration import ArmCalibration, calibrations
 from marl_handover.hardware.clock import Clock, RealClock
 from marl_handover.hardware.errors import BoardReset, DeviceError, PortLost, Stopped, WrongState
-from marl_handover.hardware.gate import SafetyGate
+from marl_handover.hardware.gate import JointCommand, SafetyGate
+from marl_handover.hardware.held import Pulses, require_held, stands
 from marl_handover.hardware.latch import StopLatch
 from marl_handover.hardware.settings import ARMS, HardwareConfig
+from marl_handover.hardware.signals import Endings, deferred
 from marl_handover.hardware.wiring import Wiring
 
 _RETRY_S = 0.2
@@ -28,6 +29,7 @@ class State(enum.StrEnum):
     DISCONNECTED = "not connected"
     CONNECTED = "connected"
     CONFIGURED = "configured"
+    ARMING = "arming"
     ARMED = "armed"
     STOPPED = "stopped"
     LOST = "lost"
@@ -55,6 +57,9 @@ class BoardSession:
         self.calibrations: tuple[ArmCalibration, ...] = ()
         self._gate: SafetyGate | None = None
         self._wiring: Wiring | None = None
+        self._endings = Endings()
+        # Held from the last look at state and stop until the line is written and noted, so that no stop can come in between.
+        self._writing, self._halts = threading.RLock(), 0
 
     @property
     def gate(self) -> SafetyGate:
@@ -71,9 +76,18 @@ class BoardSession:
         return self._wiring
 
     def connect(self) -> None:
-        """Find every board. Raises as :meth:`Ssc32.connect`; then no port is left open."""
+        """Find every board. Raises as :meth:`Boards.connect`; then no port is left open.
+
+        Until :meth:`close`, SIGTERM and SIGHUP are :class:`KeyboardInterrupt`, as Ctrl-C is, in programs that had nothing else in mind.
+        """
         self.close()
-        self.boards.connect()
+        self.latch.join()
+        try:
+            self.boards.connect()
+        except BaseException:
+            self.latch.leave()
+            raise
+        self._endings.begin()
         self.state = State.CONNECTED
 
     def configure(self) -> None:
@@ -99,15 +113,19 @@ class BoardSession:
             except DeviceError:
                 if self.clock.now_s() >= end_s:
                     raise
+            self.latch.join()
             self.wait(_RETRY_S)
         self.configure()
 
     def close(self) -> None:
         """Let all ports go; servos keep their last pulse. Again is fine."""
-        self.boards.close()
-        if self._gate is not None:
-            self._gate.forget()
-        self.state = State.DISCONNECTED
+        with deferred():
+            self.boards.close()
+            if self._gate is not None:
+                self._gate.forget()
+            self.state = State.DISCONNECTED
+            self.latch.leave()
+        self._endings.end()
 
     def wait(self, duration_s: float) -> None:
         """Wait, looking at the stop all the while. Raises :class:`Stopped`."""
@@ -134,34 +152,50 @@ class BoardSession:
             self.halt()
 
     def halt(self) -> bool:
-        """Stop every channel where it is and refuse moves until :meth:`resume`. Whether every board was reached; lost ones do not raise."""
-        reached = self.boards.stop()
-        if self._gate is not None:
-            self._gate.freeze(self.clock.now_s())
-        if self.state is State.ARMED:
-            self.state = State.STOPPED
-        return reached
+        """Stop every channel where it is and refuse moves until :meth:`resume`. Whether every board was reached; lost ones do not raise.
+
+        From any thread: once it returns, no move follows. Ctrl-C while it goes on waits for its end.
+        """
+        with deferred(), self._writing:
+            self._halts += 1
+            reached = self.boards.stop()
+            if self._gate is not None:
+                self._gate.freeze(self.clock.now_s())
+            if self.state in (State.ARMING, State.ARMED):
+                self.state = State.STOPPED
+            return reached
 
     def resume(self) -> None:
         """After the stop was cleared: read back where the channels are, to 10 us, and allow moves from there.
 
-        Raises :class:`Stopped` while the stop is latched, and :class:`BoardReset` if a board has forgotten.
+        Raises :class:`Stopped` while the stop is latched, :class:`BoardReset` if a board has forgotten any channel, and
+        :class:`GateRejection` if it holds one outside its limits.
         """
         if self.state is not State.STOPPED:
             raise WrongState("resume", self.state, State.STOPPED)
         if self.latch.is_set():
             raise Stopped(self.latch.reason())
+        halts = self._halts
         if not self.dry_run:
             with self._watched():
-                self.boards.require_powered(self.boards.by_name)
                 self._refer(self.boards.pulses())
-        self.state = State.ARMED
+        with self._allowed(State.STOPPED):
+            if halts != self._halts:
+                raise Stopped("again, meanwhile")
+            self.state = State.ARMED
 
     def limp(self) -> None:
-        """No more pulses: the arms sink. They have to be put into the parked pose and armed again."""
-        self.boards.limp()
-        self.gate.forget()
-        self.state = State.CONFIGURED
+        """No more pulses: the arms sink. They have to be put into the parked pose and armed again. In a dry run nothing sinks.
+
+        Raises :class:`PortLost` if a board was not reached; the others' arms sink all the same.
+        """
+        try:
+            with self._writing, self._watched():
+                self.boards.limp()
+        finally:
+            self.gate.forget()
+            if self.state is not State.LOST:
+                self.state = State.CONFIGURED
 
     @contextlib.contextmanager
     def _watched(self) -> Iterator[None]:
@@ -176,9 +210,31 @@ class BoardSession:
             self.state = State.CONFIGURED
             raise
 
-    def _refer(self, pulses: Mapping[str, Mapping[int, int | None]]) -> None:
-        """Take what the boards put out for where the arms are: the middle of the 10 us that a reading may mean."""
-        middles = {name: {channel: (pulse or 0) + 5.0 for channel, pulse in found.items()} for name, found in pulses.items()}
-        for arm in range(len(ARMS)):
-            joints, fingers = self.wiring.state(middles, arm)
-            self.gate.refer(arm, np.clip(joints, self.model.arm.lower_rad, self.model.arm.upper_rad), fingers)
+    @contextlib.contextmanager
+    def _allowed(self, needs: State) -> Iterator[None]:
+        """Inside, state and stop are as they were found, and no other thread can stop the arms.
+
+        Raises :class:`Stopped` or :class:`WrongState` if the arms must not be sent anything.
+        """
+        with self._writing:
+            self._require(needs)
+            self.obey()
+            yield
+
+    def _require(self, needs: State) -> None:
+        if self.state is State.STOPPED and needs is not State.STOPPED:
+            raise Stopped(self.latch.reason() or "earlier")
+        if self.state is not needs:
+            raise WrongState("move", self.state, needs)
+
+    def _refer(self, pulses: Pulses) -> list[JointCommand]:
+        """Take what the boards put out for where the arms are, and return that: commands to stay there, within every joint's limits.
+
+        Raises :class:`BoardReset` if a channel has no pulse, and :class:`GateRejection` if an arm is held outside its limits.
+        """
+        require_held(pulses)
+        held = [stands(self.config, self.calibrations, self.model.arm, pulses, arm) for arm in range(len(ARMS))]
+        stay = [JointCommand(arm, joints, fingers) for arm, (joints, fingers) in enumerate(held)]
+        for command in stay:
+            self.gate.refer(*command)
+        return stay

@@ -9,18 +9,20 @@ from __future__ import annotations
 import math
 import os
 import re
-import tempfile
 from dataclasses import dataclass, field
 
 from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import require_at_least, require_between, require_choice, require_positive
 from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.protocol import BAUDS, CHANNELS, PULSE_US
+from marl_handover.hardware.roll import user_path
 
 FIRST_MOVES = ("ask", "refuse")
 ON_DISCONNECT = ("hold", "limp", "park")
 ARMS = ("left", "right")
 """Names of the arms in settings, by arm index."""
+MAX_PARK_DEG_S = 90.0
+"""Slow enough for a hand to get out of the way; servos can do 260."""
 
 
 @dataclass
@@ -118,6 +120,7 @@ class EmulatorConfig:
     scale_sd: float = 0.02  # relative, of us per degree; cut at two standard deviations, as the offset is
     offset_sd_us: float = 15.0
     dead_band_us: float = 8.0  # full width; a HS-755HB's
+    dead_band_sd_us: float = 3.0  # from servo to servo; cut at two standard deviations, as the others are
     lag_s: float = 0.03
     settle_sd_us: float = 1.0  # where a servo comes to rest, drawn anew at each stop
     speed_deg_s: list[float] = field(
@@ -145,15 +148,17 @@ class HardwareConfig:
     first_move: str = "ask"  # ask somebody to confirm the parked pose, or refuse to move a board that has no reference
     on_disconnect: str = "hold"  # hold (servos stay on), limp (arms sink), park (drive there, then hold)
     park_deg_s: float = 30.0  # speed on the way to the parked pose
-    stop_file: str = ""  # the latched stop; empty: one of this user in the system's folder for temporary files
+    stop_file: str = ""  # the latched stop, an absolute path; empty: this user's, /tmp/marl-handover-UID.stop
     log_entries: int = 20_000  # of the log of every byte; older ones are dropped
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits, or wiring that cannot be."""
         require_choice("hardware.first_move", self.first_move, FIRST_MOVES)
         require_choice("hardware.on_disconnect", self.on_disconnect, ON_DISCONNECT)
-        require_positive("hardware.park_deg_s", self.park_deg_s)
+        require_between("hardware.park_deg_s", self.park_deg_s, 1, MAX_PARK_DEG_S)
         require_at_least("hardware.log_entries", self.log_entries, 1)
+        if self.stop_file and not os.path.isabs(self.stop_file):
+            raise InvalidSetting("hardware.stop_file", self.stop_file, "an absolute path: every shell has to find the same file")
         if set(self.arms) != set(ARMS):
             raise InvalidSetting("hardware.arms", sorted(self.arms), f"wiring of {' and '.join(ARMS)}")
         if set(self.nominal) != set(ARM_JOINTS):
@@ -202,7 +207,7 @@ class HardwareConfig:
             require_positive(f"hardware.timeouts.{name}", getattr(times, name))
         require_at_least("hardware.timeouts.retries", times.retries, 0)
         emulator = self.emulator
-        for name in ("offset_sd_us", "dead_band_us", "settle_sd_us", "end_stop_deg", "boot_s"):
+        for name in ("offset_sd_us", "dead_band_us", "dead_band_sd_us", "settle_sd_us", "end_stop_deg", "boot_s"):
             require_at_least(f"hardware.emulator.{name}", getattr(emulator, name), 0)
         if not re.search(r"SSC32-V\d+\.\d+", emulator.firmware):
             raise InvalidSetting("hardware.emulator.firmware", emulator.firmware, "SSC32-V and a number, such as SSC32-V2.50USB")
@@ -221,4 +226,4 @@ class HardwareConfig:
 
     def stop_path(self) -> str:
         """The file whose presence is the latched stop. The same for every session of a user, wherever it was started."""
-        return self.stop_file or os.path.join(tempfile.gettempdir(), f"marl-handover-{os.getuid()}.stop")
+        return self.stop_file or str(user_path(".stop"))

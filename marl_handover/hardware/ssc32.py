@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple, TypeVar
 
@@ -39,7 +40,7 @@ class Ssc32:
         timeouts: limits of waiting.
         clock: time.
         log_entries: length of the byte log.
-        dry_run: write queries only.
+        dry_run: write queries and stops only.
     """
 
     def __init__(
@@ -47,7 +48,8 @@ class Ssc32:
     ) -> None:
         self.name, self.config, self.dry_run = name, config, dry_run
         self.firmware: protocol.Firmware | None = None
-        self._timeouts, self._clock, self._log_entries = timeouts, clock, log_entries
+        self._timeouts, self._clock = timeouts, clock
+        self._log: deque[Logged] = deque(maxlen=log_entries)
         self._wire: Wire | None = None
         self._known: set[int] = set()
 
@@ -65,8 +67,8 @@ class Ssc32:
 
     @property
     def log(self) -> list[Logged]:
-        """Every byte with its time, as far back as the log goes."""
-        return list(self._wire.log) if self._wire is not None else []
+        """Every byte with its time, as far back as the log goes, whatever became of the port meanwhile."""
+        return list(self._log)
 
     def connect(self) -> protocol.Firmware:
         """Open the port and find the board on it, trying other rates if allowed; every channel counts as never moved.
@@ -77,7 +79,7 @@ class Ssc32:
             UnsuitableFirmware: it is no SSC-32, or one without ``STOP``.
         """
         self.close()
-        wire = Wire(choose_port(self.config.port), self.config.baud, self._timeouts, self._clock, self._log_entries)
+        wire = Wire(choose_port(self.config.port), self.config.baud, self._timeouts, self._clock, self._log)
         try:
             self.firmware = self._handshake(wire)
         except BaseException:
@@ -147,11 +149,10 @@ class Ssc32:
         return SentLine(self.name, self.wire.write(data), data, True)
 
     def limp(self, channels: Iterable[int]) -> SentLine:
-        """No more pulses: arms sink. Written even in a dry run; the next move is a first one."""
+        """No more pulses: arms sink, but for a dry run. The next move is a first one."""
         listed = list(channels)
-        data = protocol.encode_line([protocol.Level(channel, False) for channel in listed])
         self._known.difference_update(listed)
-        return SentLine(self.name, self.wire.write(data), data, True)
+        return self._send(protocol.encode_line([protocol.Level(channel, False) for channel in listed]))
 
     def _pulses_once(self, listed: list[int]) -> dict[int, int | None]:
         answer = self._asked(protocol.query_pulses(listed), len(listed), lambda reply: protocol.parse_pulses(reply, len(listed)))

@@ -1,7 +1,8 @@
 """Planned motions as group moves at the boards' pace.
 
 Every ``period_s`` each moving arm is sent where its motion will be one period later, with that time; so at most one period of motion is
-ever on a board, and a host that dies leaves arms that hold a moment later.
+ever on a board, and a host that dies leaves arms that hold a moment later. A host that is late does not make up for it: the rest of the
+motion comes later, at its own speed.
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ Floats = NDArray[np.float64]
 START_RAD = math.radians(3.0)
 """How far from where an arm has been sent its motion may begin."""
 
+SLACK_S = 0.01
+"""A move may be written so long after it is due without the next one coming later: half a frame, and more than asking the boards takes."""
+
 
 class Streamed(NamedTuple):
-    """How a motion went: group moves sent, greatest lateness, and whether it was played to its end or called off."""
+    """How a motion went: group moves sent, greatest lateness of one, and whether it was played to its end or called off."""
 
     moves: int
     late_s: float
@@ -71,10 +75,9 @@ def stream(
     if not tracks:
         return Streamed(0, 0.0, True)
     begin_s, end_s = min(float(track.t_s[0]) for track in tracks), max(float(track.t_s[-1]) for track in tracks)
-    started_s, moves, latest_s = clock.now_s(), 0, 0.0
+    due_s, moves, latest_s = clock.now_s(), 0, 0.0
     count = max(1, math.ceil((end_s - begin_s) / settings.period_s - 1e-9))
     for number in range(count):
-        due_s = started_s + number * settings.period_s
         driver.wait(due_s - clock.now_s())
         late_s = clock.now_s() - due_s
         latest_s = max(latest_s, late_s)
@@ -85,6 +88,8 @@ def stream(
             return Streamed(moves, latest_s, False)
         t_s = begin_s + (number + 1) * settings.period_s
         driver.move([track.at(t_s) for track in tracks if track.t_s[0] < t_s < track.t_s[-1] + settings.period_s], settings.period_s)
+        sent_s = clock.now_s()
+        due_s = (due_s if sent_s - due_s <= SLACK_S else sent_s) + settings.period_s
         moves += 1
         if on_tick is not None:
             on_tick(min(t_s, end_s))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import termios
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -13,11 +14,13 @@ import serial
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.errors import PortLost, PortNotFound
 from marl_handover.hardware.ports import list_serial_ports
+from marl_handover.hardware.protocol import CANCEL
 from marl_handover.hardware.settings import TimeoutConfig
 
 BITS_PER_BYTE = 10
 _SCHEMES = "marl_handover.hardware.emulator"
-_FAILURES = (serial.SerialException, OSError)  # in_waiting of a port that was pulled out raises a bare OSError
+_FAILURES = (serial.SerialException, OSError, termios.error)
+"""Of a port that was pulled out: pyserial lets ``in_waiting`` raise a bare OSError, and flushing termios's own error, which is none."""
 
 if _SCHEMES not in serial.protocol_handler_packages:
     serial.protocol_handler_packages.append(_SCHEMES)  # so that every port of this package may be ssc32emu://name
@@ -39,17 +42,17 @@ class Wire:
         baud: bits per second.
         timeouts: limits of waiting.
         clock: whose time the log is in.
-        log_entries: how many the log keeps.
+        log: where every byte is noted; it outlives the port.
 
     Raises:
         PortNotFound: it cannot be opened: it is not there, somebody else has it, or the user may not.
     """
 
-    def __init__(self, port: str, baud: int, timeouts: TimeoutConfig, clock: Clock, log_entries: int) -> None:
-        self.port, self._timeouts, self._clock = port, timeouts, clock
-        self.log: deque[Logged] = deque(maxlen=log_entries)
-        self._lock = threading.RLock()
-        self._free_s = 0.0
+    def __init__(self, port: str, baud: int, timeouts: TimeoutConfig, clock: Clock, log: deque[Logged]) -> None:
+        self.port, self._timeouts, self._clock, self.log = port, timeouts, clock, log
+        # Two locks: a stop from another thread must not wait for an answer.
+        self._asking, self._sending = threading.RLock(), threading.RLock()
+        self._free_s, self._cut = 0.0, False
         try:
             self._serial: Any = serial.serial_for_url(
                 port, baudrate=baud, timeout=timeouts.reply_s, write_timeout=timeouts.write_s, exclusive=True
@@ -75,10 +78,16 @@ class Wire:
             self._serial.baudrate = baud
 
     def write(self, data: bytes) -> float:
-        """Send; the time at which it was handed over."""
-        with self._lock, self._guarded("writing"):
+        """Send; the time at which it was handed over.
+
+        After a write that was cut short, by a signal or a full buffer, the board is first told to drop the fragment: glued to one, a line
+        may well be another move.
+        """
+        with self._sending, self._guarded("writing"):
             now_s = self._clock.now_s()
+            data, self._cut = (CANCEL + data if self._cut else data), True
             self._serial.write(data)
+            self._cut = False
             self._free_s = max(now_s, self._free_s) + len(data) * BITS_PER_BYTE / self.baud
             self.log.append(Logged(now_s, ">", data))
             return now_s
@@ -98,7 +107,7 @@ class Wire:
 
         What had come in before is thrown away: it answers nothing that was asked now.
         """
-        with self._lock, self._guarded("reading"):
+        with self._asking, self._guarded("reading"):
             self._serial.reset_input_buffer()
             end_s = self._clock.now_s() + self.backlog_s() + (self._timeouts.reply_s if timeout_s is None else timeout_s)
             self.write(question)
@@ -115,7 +124,7 @@ class Wire:
 
     def drain(self, quiet_s: float) -> None:
         """Throw away what comes in, until nothing has for ``quiet_s``, or a second has passed."""
-        with self._lock, self._guarded("reading"):
+        with self._asking, self._guarded("reading"):
             self._serial.timeout = quiet_s
             end_s = self._clock.now_s() + 1.0
             while self._serial.read(256) and self._clock.now_s() < end_s:

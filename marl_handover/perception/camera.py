@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -48,13 +49,17 @@ class Camera(ABC):
     name = "camera"
 
     @abstractmethod
-    def read(self, max_age_s: float | None = None) -> Frame:
-        """The newest picture that was not read before; waits for it if need be.
+    def read(self, max_age_s: float | None = None, wait_s: float | None = None) -> Frame:
+        """The newest picture that was not read before; waits for it if need be, for ``wait_s`` (None: as the settings have it).
 
         Raises:
             StaleFrame: there is none that is at most ``max_age_s`` old (None: as the settings have it).
             EndOfFrames: there will be none any more.
         """
+
+    def newest(self) -> Frame | None:
+        """The newest picture there is, for who only watches; it still counts as unread. None: pictures are taken when they are read."""
+        return None
 
     def close(self) -> None:  # noqa: B027 - a source without a device has nothing to let go
         """Let the device go; a second call does nothing."""
@@ -74,8 +79,8 @@ class RenderedCamera(Camera):
     def __init__(self, picture: Callable[[], Pixels | Frame], max_age_s: float, clock: Clock = time.monotonic) -> None:
         self._picture, self._max_age_s, self._clock, self._number = picture, max_age_s, clock, 0
 
-    def read(self, max_age_s: float | None = None) -> Frame:
-        """See :meth:`Camera.read`."""
+    def read(self, max_age_s: float | None = None, wait_s: float | None = None) -> Frame:
+        """See :meth:`Camera.read`; there is nothing to wait for."""
         limit = self._max_age_s if max_age_s is None else max_age_s
         began_s = self._clock()
         taken = self._picture()
@@ -98,6 +103,51 @@ class Device(Protocol):
 
     def stop(self) -> None:
         """Let the device go."""
+
+
+class Reopening:
+    """A device that is opened anew whenever it has given nothing for a while: a cable that was pulled out comes back.
+
+    Args:
+        opened: opens it.
+        after_s: how long it may give nothing, and how long to leave between two attempts.
+        clock: in s.
+
+    Raises:
+        NoCamera: it is not there in the beginning.
+    """
+
+    def __init__(self, opened: Callable[[], Device], after_s: float, clock: Clock = time.monotonic) -> None:
+        self._opened, self._after_s, self._clock = opened, after_s, clock
+        self._device: Device | None = opened()
+        self.name = self._device.name
+        self._good_s, self._stopped = clock(), False
+
+    def grab(self) -> Pixels | None:
+        """The next picture; None if none came."""
+        image = None if self._device is None else self._device.grab()
+        now_s = self._clock()
+        if image is not None:
+            self._good_s = now_s
+        elif now_s - self._good_s > self._after_s and not self._stopped:
+            self._reopen()
+        return image
+
+    def stop(self) -> None:
+        """Let the device go."""
+        self._stopped = True
+        if self._device is not None:
+            self._device.stop()
+
+    def _reopen(self) -> None:
+        if self._device is not None:
+            self._device.stop()
+            self._device = None
+        with contextlib.suppress(NoCamera):
+            self._device = self._opened()
+        if self._stopped and self._device is not None:  # somebody stopped it while it was being opened
+            self._device.stop()
+        self._good_s = self._clock()
 
 
 class LiveCamera(Camera):
@@ -131,17 +181,21 @@ class LiveCamera(Camera):
             self.close()
             raise
 
-    def read(self, max_age_s: float | None = None) -> Frame:
+    def read(self, max_age_s: float | None = None, wait_s: float | None = None) -> Frame:
         """See :meth:`Camera.read`."""
         limit = self._max_age_s if max_age_s is None else max_age_s
         with self._news:
-            self._news.wait_for(lambda: self._fresh(limit), timeout=self._timeout_s)
+            self._news.wait_for(lambda: self._fresh(limit), timeout=self._timeout_s if wait_s is None else wait_s)
             if not self._fresh(limit):
                 newest_s = self._opened_s if self._newest is None else self._newest.t_s
                 raise StaleFrame(self.name, self._clock() - newest_s, limit)
             assert self._newest is not None
             self._read = self._newest.number
             return self._newest
+
+    def newest(self) -> Frame | None:
+        """See :meth:`Camera.newest`."""
+        return self._newest
 
     def close(self) -> None:
         """Stop the thread and let the device go; a second call does nothing."""

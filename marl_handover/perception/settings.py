@@ -10,7 +10,10 @@ from marl_handover.errors import InvalidSetting
 
 SOURCES = ("uvc", "realsense", "video", "folder", "rendered")
 OBJECTS = ("marker", "square")
-DICTIONARIES = ("4x4_50", "5x5_100", "6x6_250", "16h5", "25h9", "36h11")
+MARKERS = {"4x4_50": 50, "5x5_100": 100, "6x6_250": 250, "16h5": 30, "25h9": 35, "36h11": 587}
+"""How many markers each dictionary has."""
+
+DICTIONARIES = tuple(MARKERS)
 
 
 @dataclass
@@ -79,8 +82,8 @@ class TargetConfig:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
         require_choice("target.object", self.object, OBJECTS)
         require_choice("target.dictionary", self.dictionary, DICTIONARIES)
-        require_at_least("target.block_id", self.block_id, 0)
-        require_at_least("target.goal_id", self.goal_id, 0)
+        require_between("target.block_id", self.block_id, 0, MARKERS[self.dictionary] - 1)
+        require_between("target.goal_id", self.goal_id, 0, MARKERS[self.dictionary] - 1)
         if self.block_id == self.goal_id:
             raise InvalidSetting("target.goal_id", self.goal_id, "another marker than target.block_id")
         require_positive("target.goal_mm", self.goal_mm)

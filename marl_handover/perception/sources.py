@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import importlib
 import itertools
@@ -16,7 +17,7 @@ import numpy as np
 
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
 from marl_handover.perception.calibration import Pixels
-from marl_handover.perception.camera import Camera, Clock, EndOfFrames, Frame, LiveCamera, NoCamera, RenderedCamera
+from marl_handover.perception.camera import Camera, Clock, EndOfFrames, Frame, LiveCamera, NoCamera, RenderedCamera, Reopening
 from marl_handover.perception.settings import CameraConfig
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -47,7 +48,7 @@ def open_camera(config: CameraConfig, picture: Callable[[], Pixels | Frame] | No
         return Recording(_video(Path(config.path)), clock)
     if config.source == "folder":
         return Recording(_folder(Path(config.path), config.frames_per_s), clock)
-    device = UvcDevice(config) if config.source == "uvc" else RealSenseDevice(config)
+    device = Reopening(lambda: UvcDevice(config) if config.source == "uvc" else RealSenseDevice(config), config.timeout_s)
     return LiveCamera(device, config.warm_up_s, config.max_age_s, config.timeout_s, clock)
 
 
@@ -64,7 +65,7 @@ class Recording(Camera):
     def __init__(self, pictures: Iterator[tuple[float, Pixels]], clock: Clock) -> None:
         self._pictures, self._opened_s, self._number = pictures, clock(), 0
 
-    def read(self, max_age_s: float | None = None) -> Frame:
+    def read(self, max_age_s: float | None = None, wait_s: float | None = None) -> Frame:
         """The next picture; it is never too old."""
         following = next(self._pictures, None)
         if following is None:
@@ -172,8 +173,9 @@ class RealSenseDevice:
         return np.array(colour.get_data(), dtype=np.uint8) if colour else None
 
     def stop(self) -> None:
-        """Stop the stream."""
-        self._pipeline.stop()
+        """Stop the stream; that of a device that is gone has stopped."""
+        with contextlib.suppress(RuntimeError):
+            self._pipeline.stop()
 
 
 def _realsense() -> Any:

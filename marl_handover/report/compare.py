@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -12,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 from marl_handover.cell import build_cell
 from marl_handover.config import CellConfig
 from marl_handover.report.compare_bars import bars_figure, endings_figure, legend_below
-from marl_handover.report.palette import FAINT, GREY, INK, series_style
+from marl_handover.report.palette import FAINT, GREY, INK, PAPER, series_marker, series_style
 from marl_handover.report.table import Axes
 from marl_handover.report.workspace import workspace_figure
 
@@ -25,6 +26,9 @@ MEASURES = {
     "training_success_rate": "success in training",
     "training_mean_length": "mean transfers an episode in training",
 }
+MARKERS = 14
+"""On a curve, at most."""
+
 SHARES = ("success_rate", "training_success_rate")
 
 
@@ -51,7 +55,7 @@ def curves_figure(results: Tree, spec: Tree) -> Figure | None:
     figure = Figure(figsize=(7.2, 4.4), layout="constrained")
     axes = figure.add_subplot()
     for index, row in enumerate(shown):
-        _curve(axes, row, spec, series_style(index))
+        _curve(axes, row, spec, {**series_style(index), "marker": series_marker(index)})
     if spec["measure"] in SHARES:
         axes.set_ylim(-0.03, 1.03)
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
@@ -74,8 +78,18 @@ def _curve(axes: Axes, row: Tree, spec: Tree, style: Mapping[str, Any]) -> None:
     scale = 1.0 / row["settings"]["steps"] if spec["x"] == "share" else 1.0
     steps = scale * np.array(curve["step"])
     label = f"{row['label']} ({curve['runs']} seed{'s' if curve['runs'] > 1 else ''})"
-    marker = "o" if len(steps) == 1 else None
-    axes.plot(steps, curve["value"], label=label, linewidth=1.6, marker=marker, **style)
+    every = math.ceil(len(steps) / MARKERS)
+    axes.plot(
+        steps,
+        curve["value"],
+        label=label,
+        linewidth=1.6,
+        markersize=4.5,
+        markeredgecolor=PAPER,
+        markeredgewidth=0.5,
+        markevery=every,
+        **style,
+    )
     axes.fill_between(steps, curve["low"], curve["high"], color=style["color"], alpha=0.18, linewidth=0)
     for stage in row["settings"]["curriculum"][:-1]:
         if 0 < stage["until_step"] < row["settings"]["steps"]:
@@ -93,9 +107,11 @@ def profiles_figure(results: Tree, spec: Tree) -> Figure | None:
     thresholds = np.array(profiles["thresholds"])
     for index, (name, band) in enumerate(profiles["rows"].items()):
         style: Mapping[str, Any] = series_style(index)
-        axes.plot(thresholds, band["value"], label=labels[name], linewidth=1.6, drawstyle="steps-post", **style)
+        # Where curves lie on each other, the lower ones show beside the upper.
+        width = 1.4 + 2.6 * (1 - (index + 1) / len(profiles["rows"]))
+        axes.plot(thresholds, band["value"], label=labels[name], linewidth=width, drawstyle="steps-post", **style)
         axes.fill_between(thresholds, band["low"], band["high"], color=style["color"], alpha=0.15, linewidth=0, step="post")
-    axes.set_xlim(thresholds[0], thresholds[-1])
+    axes.set_xlim(thresholds[0], thresholds[-1] + 0.02 * (thresholds[-1] - thresholds[0]))
     axes.set_ylim(-0.03, 1.05)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(PercentFormatter(1.0))

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from marl_handover.report.palette import BLUE, FAINT, GREY, INK, OUTCOMES, PAPER, RED
+from marl_handover.report.palette import BLUE, FAINT, GREY, HATCHES, INK, OUTCOMES, PAPER, RED
 from marl_handover.report.table import Axes
 
 Tree = Mapping[str, Any]
@@ -32,7 +32,6 @@ MEASURES = {
 KINDS = {"continuous": (BLUE, ""), "discretised": (RED, "//"), "not learned": (GREY, "..")}
 """What a row's bar says by colour and hatching."""
 
-ENDINGS = {"success": "", "wrong_orientation": "//", "wrong_position": "xx", "timeout": ".."}
 SHOWN_PERCENT = 7.0
 """Narrower pieces of a bar carry no number."""
 
@@ -86,7 +85,7 @@ def endings_figure(results: Tree, spec: Tree) -> Figure | None:
     for line, (row, name) in enumerate(shown):
         found = row["evaluations"][name]
         left = 0.0
-        for ending, hatch in ENDINGS.items():
+        for ending, hatch in HATCHES.items():
             share = 100 * found["outcomes"][ending] / found["episodes"]
             axes.barh(line, share, left=left, height=0.62, color=OUTCOMES[ending], hatch=hatch, edgecolor=PAPER, linewidth=0)
             if share >= SHOWN_PERCENT:
@@ -98,7 +97,7 @@ def endings_figure(results: Tree, spec: Tree) -> Figure | None:
     axes.set_xlabel("episodes [%]", fontsize=9)
     _ruled(axes)
     _named(axes, lines)
-    patches = [Patch(facecolor=OUTCOMES[key], hatch=hatch, edgecolor=PAPER, label=key.replace("_", " ")) for key, hatch in ENDINGS.items()]
+    patches = [Patch(facecolor=OUTCOMES[key], hatch=hatch, edgecolor=PAPER, label=key.replace("_", " ")) for key, hatch in HATCHES.items()]
     figure.legend(handles=patches, loc="outside lower center", ncols=len(patches), fontsize=8, frameon=False)
     _titled(figure, spec)
     return figure

@@ -2,56 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from marl_handover.errors import CorruptFile, MissingFile
-from marl_handover.report.palette import BLUE, FAINT, GREY, OUTCOMES, YELLOW
+from marl_handover.errors import CorruptFile
+from marl_handover.report.palette import BLUE, FAINT, GREY, OUTCOMES, PAPER, YELLOW
 from marl_handover.report.table import Axes
-
-
-class Played(NamedTuple):
-    """Successful episodes of a trace: start and goal (n, 3) in mm and rad, transfers int (n,)."""
-
-    start: NDArray[np.float64]
-    goal: NDArray[np.float64]
-    transfers: NDArray[np.int64]
-
-
-def read_trace(path: Path) -> Played:
-    """The successful episodes of a trace that ``evaluate`` wrote. Raises :class:`MissingFile` or :class:`CorruptFile`."""
-    if not path.is_file():
-        raise MissingFile("trace", path)
-    first: dict[int, tuple[list[float], list[float]]] = {}
-    count: dict[int, int] = {}
-    solved: set[int] = set()
-    with path.open(encoding="utf-8") as stream:
-        for number, line in enumerate(stream, start=1):
-            try:
-                row = json.loads(line)
-                episode = int(row["episode"])
-                first.setdefault(episode, (_pose(row["state"]), _pose(row["goal"])))
-                count[episode] = count.get(episode, 0) + 1
-                if row["outcome"] == "success":
-                    solved.add(episode)
-            except (ValueError, KeyError, TypeError) as error:
-                raise CorruptFile("trace", path, f"line {number} is no step of an episode") from error
-    if not first:
-        raise CorruptFile("trace", path, "it holds no step")
-    start, goal = (np.array([first[episode][column] for episode in sorted(solved)], float).reshape(-1, 3) for column in (0, 1))
-    return Played(start, goal, np.array([count[episode] for episode in sorted(solved)], int))
-
-
-def _pose(value: Any) -> list[float]:
-    x_mm, y_mm, theta_rad = (float(number) for number in value)
-    return [x_mm, y_mm, theta_rad]
 
 
 def check_evaluation(result: Mapping[str, Any], path: Path) -> None:
@@ -116,7 +78,7 @@ def _histogram(axes: Axes, transfers: NDArray[np.int64], optimal: NDArray[np.int
     axes.set_ylabel("successful episodes [%]")
     axes.set_title(f"transfers of {len(transfers):,} successful episodes", fontsize=9)
     axes.margins(y=0.2)  # room for the legend
-    axes.legend(fontsize=8, frameon=False, ncols=2, loc="upper center")
+    axes.legend(fontsize=8, ncols=2, loc="upper center", facecolor=PAPER, edgecolor="none", framealpha=1.0)
     _tidy(axes)
 
 

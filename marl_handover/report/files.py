@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -33,7 +34,8 @@ def save_figure(figure: Figure, path: Path, name: str = "out") -> None:
     with _writable(path, name) as temporary:
         # Without a date, the same picture is the same file.
         metadata = {".png": None, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}[suffix]
-        figure.savefig(temporary, format=suffix[1:], dpi=DOTS_PER_INCH, metadata=metadata)
+        with matplotlib.rc_context({"pdf.fonttype": 42}):  # text stays text, in a font that editors and publishers take
+            figure.savefig(temporary, format=suffix[1:], dpi=DOTS_PER_INCH, metadata=metadata)
         temporary.replace(path)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,6 +12,9 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 from marl_handover.report.metrics import Metrics, common_curve
 from marl_handover.report.palette import BLUE, FAINT, GREY, INK, RED, YELLOW
 from marl_handover.report.table import Axes
+
+LONGEST = 64
+"""Letters of a title that have room."""
 
 
 def learning_figure(runs: Mapping[str, Metrics]) -> Figure:
@@ -50,10 +54,18 @@ def stage_changes(run: Metrics) -> list[float]:
 
 
 def _title(names: list[str]) -> str:
-    text = ", ".join(names)
-    if len(names) == 1 or len(text) <= 70:
-        return text if len(names) == 1 else f"{text}: mean, worst and best"
-    return f"{names[0]} and {len(names) - 1} more: mean, worst and best"
+    folders = [Path(name).name for name in names]
+    shown = [_end(name, LONGEST) for name in (folders if len(set(folders)) == len(names) > 1 else names)]
+    if len(names) == 1:
+        return shown[0]
+    text = ", ".join(shown)
+    if len(text) > LONGEST:
+        text = f"{_end(shown[0], LONGEST // 2)} and {len(names) - 1} more"
+    return f"{text}: mean, worst and best"
+
+
+def _end(name: str, longest: int) -> str:
+    return name if len(name) <= longest else f"… {name[-longest:]}"
 
 
 def _curve(axes: Axes, runs: list[Metrics], column: str, colour: str) -> None:

@@ -2,30 +2,92 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import MotionConfig
-from marl_handover.motion.trajectory import TransferMotion
-from marl_handover.report.palette import BLUE, FAINT, GREY, INK, RED, YELLOW, arm_colour
+from marl_handover.errors import CorruptFile, InvalidSetting
+from marl_handover.motion.trajectory import PHASES, CyclePaths, Phase, TransferMotion
+from marl_handover.report.palette import BLUE, FAINT, GREY, INK, PAPER, RED, YELLOW, arm_colour
 from marl_handover.report.table import Axes, draw_bases, draw_sectors, frame_table
 from marl_handover.runtime.motions import CARRYING, clearances_mm, grip_mm
 
 Floats = NDArray[np.float64]
 
-JOINT_STYLES: tuple[tuple[str, Any], ...] = ((BLUE, "-"), (RED, "-"), (YELLOW, "-"), (INK, "--"), (GREY, ":"))
+JOINT_STYLES: tuple[tuple[str, Any], ...] = ((BLUE, "-"), (RED, (0, (6, 1.5))), (YELLOW, "-."), (INK, "--"), (GREY, ":"))
 """Colour and line of each joint: told apart without colours too."""
 
 SHOWN_MM = 150.0
 """Clearances above this are not told apart."""
+
+_FIT_MM, _LABEL_MM = 2.0, 30.0
+
+
+def read_motions(content: Mapping[str, Any], path: Path) -> list[TransferMotion]:
+    """The motions that ``plan motion=FILE`` wrote to ``path``; control points and fingers, which the file does not hold, are empty.
+
+    Raises:
+        CorruptFile: for anything else.
+    """
+    try:
+        motions = [_motion(row) for row in content["transfers"]]
+    except KeyError as error:
+        raise CorruptFile("motion", path, f"it lacks {error.args[0]!r}") from error
+    except (TypeError, ValueError) as error:
+        raise CorruptFile("motion", path, str(error)) from error
+    if not motions:
+        raise CorruptFile("motion", path, "it has no transfers")
+    return motions
+
+
+def require_fit(motions: Sequence[TransferMotion], model: CellModel) -> None:
+    """Raise :class:`InvalidSetting` unless the hand is at the block where the motions take it: they are of another cell."""
+    for motion in motions:
+        taken = next(phase.joints_rad[0] for phase in motion.phases if phase.name in CARRYING)
+        if np.linalg.norm(grip_mm(model, motion.arm, taken)[:2] - motion.from_mm) > _FIT_MM:
+            raise InvalidSetting("cell", model.cell.config.name, "the cell of the motions; this one's arms would miss the block with them")
+
+
+def _motion(row: Mapping[str, Any]) -> TransferMotion:
+    phases = tuple(_phase(part) for part in row["phases"])
+    if not any(phase.name in CARRYING for phase in phases):
+        raise ValueError("a transfer has no phase in which the block is carried")
+    none = np.empty((0, 5))
+    return TransferMotion(
+        arm=ARM_LETTERS.index(row["arm"]),
+        from_mm=_numbers(row["from"], 2),
+        to_mm=_numbers(row["to"], 2),
+        paths=CyclePaths(none, none, none),
+        phases=phases,
+        other_joints_rad=_numbers(row["parked_other_rad"], 5),
+        path_length_mm=float(row["path_length_mm"]),
+        min_clearance_mm=float(row["min_clearance_mm"]),
+        planning_ms=float(row["planning_ms"]),
+    )
+
+
+def _phase(part: Mapping[str, Any]) -> Phase:
+    name, t_s = str(part["name"]), np.asarray(part["t_s"], float)
+    if name not in PHASES or t_s.ndim != 1 or not len(t_s):
+        raise ValueError(f"{name!r} is no phase of a motion")
+    return Phase(name, t_s, _numbers(part["joints_rad"], len(t_s), 5), np.empty(0))
+
+
+def _numbers(values: Any, *shape: int) -> Floats:
+    array = np.asarray(values, float)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"{' x '.join(map(str, shape))} finite numbers were expected")
+    return array
 
 
 def motion_figure(motions: Sequence[TransferMotion], model: CellModel, settings: MotionConfig) -> Figure:
@@ -57,14 +119,13 @@ def _pieces(motion: TransferMotion, model: CellModel) -> list[tuple[bool, Floats
 
 def _draw_above(axes: Axes, motions: Sequence[TransferMotion], model: CellModel) -> None:
     draw_sectors(axes, model.cell, strength=0.05, width=0.5)
-    numbers: dict[tuple[int, int], list[str]] = {}
-    for number, motion in enumerate(motions, start=1):
+    for motion in motions:
         _draw_path(axes, motion, model, (0, 1))
         axes.plot(*motion.from_mm, "o", color=arm_colour(motion.arm), markerfacecolor="none", markersize=7, zorder=8)
         axes.plot(*motion.to_mm, "o", color=arm_colour(motion.arm), markersize=5, zorder=8)
-        numbers.setdefault((round(float(motion.to_mm[0])), round(float(motion.to_mm[1]))), []).append(str(number))
-    for place, at in numbers.items():
-        axes.annotate(", ".join(at), place, xytext=(6, 6), textcoords="offset points", fontsize=9, zorder=9)
+    for place, at in _numbered(motions):
+        label = axes.annotate(", ".join(at), place, xytext=(6, 6), textcoords="offset points", fontsize=9, zorder=13)
+        label.set_path_effects([withStroke(linewidth=2.5, foreground=PAPER)])
     draw_bases(axes, model.cell, size=12)
     frame_table(axes, model.cell)
     axes.set_title("the grip's path from above", fontsize=9, pad=20)
@@ -78,6 +139,18 @@ def _draw_above(axes: Axes, motions: Sequence[TransferMotion], model: CellModel)
     ]
     style: dict[str, Any] = {"fontsize": 8, "frameon": False, "columnspacing": 1.0, "handletextpad": 0.4}
     axes.legend(handles=handles, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), **style)
+
+
+def _numbered(motions: Sequence[TransferMotion]) -> list[tuple[Floats, list[str]]]:
+    """Places (2,) and the numbers of the transfers that go there; places too near for labels of their own share one."""
+    found: list[tuple[Floats, list[str]]] = []
+    for number, motion in enumerate(motions, start=1):
+        near = next((at for place, at in found if np.linalg.norm(place - motion.to_mm) < _LABEL_MM), None)
+        if near is None:
+            found.append((motion.to_mm, [str(number)]))
+        else:
+            near.append(str(number))
+    return found
 
 
 def _draw_side(axes: Axes, motions: Sequence[TransferMotion], model: CellModel) -> None:

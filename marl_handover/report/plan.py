@@ -17,7 +17,7 @@ from marl_handover.errors import CorruptFile
 from marl_handover.report.palette import FAINT, GOAL, GREY, INK, arm_colour
 from marl_handover.report.table import Axes, bare, draw_bases, draw_block, draw_sectors, frame_table
 
-PANEL_INCHES = 2.9
+PANEL_INCHES, LEGEND_INCHES = 2.9, 7.5
 COLUMNS = 4
 
 
@@ -44,7 +44,9 @@ def plan_figure(plan: Mapping[str, Any], cell: Cell) -> Figure:
     transfers: Sequence[Mapping[str, Any]] = plan["transfers"]
     columns = min(len(transfers), COLUMNS)
     rows = math.ceil(len(transfers) / columns)
-    size = (max(PANEL_INCHES * columns, 5.2), _panel_height(cell) * rows + 0.8)
+    entries = _legend()
+    across = len(entries) if PANEL_INCHES * columns > LEGEND_INCHES else 3
+    size = (max(PANEL_INCHES * columns, 5.2), _panel_height(cell) * rows + (0.55 if across > 3 else 0.75))
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False).reshape(-1)
     for index, (axes, transfer) in enumerate(zip(grid, transfers, strict=False)):
@@ -54,7 +56,7 @@ def plan_figure(plan: Mapping[str, Any], cell: Cell) -> Figure:
     for axes in grid[len(transfers) :]:
         axes.set_axis_off()
     figure.suptitle(_headline(plan), fontsize=10)
-    figure.legend(handles=_legend(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    figure.legend(handles=entries, loc="outside lower center", ncols=across, fontsize=8, frameon=False)
     return figure
 
 

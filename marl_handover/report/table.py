@@ -50,11 +50,12 @@ def draw_sectors(axes: Axes, cell: Cell, strength: float = 0.1, width: float = 1
 
 def draw_circles(axes: Axes, cell: Cell) -> None:
     """Both whole circles around each base, faint, to show what the yaw limits cut off."""
+    label: str | None = "beyond the yaw limits"
     for arm, base in enumerate(cell.bases):
         for radius in (cell.r_min_mm, cell.r_max_mm):
-            colour = arm_colour(arm)
-            circle = Circle((base.x_mm, base.y_mm), radius, fill=False, edgecolor=colour, linewidth=0.6, linestyle=":", alpha=0.6, zorder=2)
-            axes.add_patch(circle)
+            style: dict[str, Any] = {"linewidth": 0.7, "linestyle": ":", "alpha": 0.7, "zorder": 2}
+            axes.add_patch(Circle((base.x_mm, base.y_mm), radius, fill=False, edgecolor=arm_colour(arm), label=label, **style))
+            label = None
 
 
 def draw_bases(axes: Axes, cell: Cell, size: float = 13.0) -> None:

@@ -14,7 +14,7 @@ from marl_handover.report.table import draw_bases, draw_chart, draw_circles, dra
 def workspace_figure(model: CellModel) -> Figure:
     """Grid points of each arm alone and of both, annulus sectors with their yaw limits, chart, bases."""
     cell, grid = model.cell, model.grid
-    figure = Figure(figsize=(8.4, 6.4), layout="constrained")
+    figure = Figure(figsize=(7.6, 6.4), layout="constrained")
     axes = figure.add_subplot()
     points = np.stack(np.meshgrid(grid.x_mm, grid.y_mm, indexing="ij"), -1)
     reached = grid.masks.sum(0)
@@ -36,5 +36,5 @@ def workspace_figure(model: CellModel) -> Figure:
         f"grid {cell.config.grid_mm:g} mm",
         fontsize=10,
     )
-    figure.legend(loc="outside lower center", ncols=3, fontsize=8, markerscale=3, frameon=False)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=8, markerscale=3, frameon=False)
     return figure

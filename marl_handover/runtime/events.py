@@ -32,13 +32,16 @@ class Event(StrEnum):
     TRANSFER = "transfer"
     ENDED = "ended"
     ARMED = "armed"
+    CONTROL = "control"  # somebody at a page asked for something; done, unless it was refused
+    PAUSED = "paused"  # no transfer begins until somebody goes on
+    RESUMED = "resumed"
     # What goes wrong.
     FAILED_GRASP = "failed_grasp"  # look again, decide again
     DROPPED = "dropped"  # the same, from where the block lies now
     BLOCK_MOVED = "block_moved"  # somebody moved it: decide from where it is
     GOAL_CHANGED = "goal_changed"  # a transfer that is going on is finished; then decide for the new goal
     BLOCK_OUTSIDE = "block_outside"  # no arm reaches it: wait, for as long as there is patience, until somebody puts it back
-    MARKER_HIDDEN = "marker_hidden"  # arms hold; wait until it is seen again
+    MARKER_HIDDEN = "marker_hidden"  # arms hold; wait until it is seen again; in vain after a transfer, and again: the episode ends
     CAMERA_FROZEN = "camera_frozen"  # arms hold; wait for new pictures
     SERIAL_LOST = "serial_lost"  # reconnect, read back where the arms are held, go on with the motion
     CONTROLLER_RESET = "controller_reset"  # nothing moves until somebody has put the arms into the parked pose; then arm, look, decide
@@ -61,6 +64,9 @@ NOTES = frozenset(
         Event.TRANSFER,
         Event.ENDED,
         Event.ARMED,
+        Event.CONTROL,
+        Event.PAUSED,
+        Event.RESUMED,
         Event.RECOVERED,
     )
 )
@@ -112,6 +118,10 @@ class EventLog:
             self._file.flush()
         if self._listener is not None:
             self._listener(row)
+
+    def show(self, listener: Callable[[dict[str, Any]], None]) -> None:
+        """Show ``listener`` each line from now on, in place of whoever was shown them before."""
+        self._listener = listener
 
     def close(self) -> None:
         """Close the file; again is fine."""

@@ -20,7 +20,6 @@ from marl_handover.config import MotionConfig
 from marl_handover.envs.backends import Execution
 from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
 from marl_handover.errors import WorkFailed
-from marl_handover.hardware.errors import Stopped
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.motion.cycle import timed_phases
 from marl_handover.motion.trajectory import CyclePaths, Phase
@@ -89,16 +88,22 @@ class HardwareBackend:
         self.same = (self.config.moved_mm, math.radians(self.config.moved_deg))
         self.check = CycleCheck(model, motion)
         self.mover = Mover(lab)
+        self.hold: Callable[[], bool] = lambda: False
+        """Called before arms are made to move; waits for as long as they must not, and says whether it had to."""
         self._last = _Sighted(np.zeros(3), -math.inf)
         self._idle = [0] * model.cell.num_arms
+        self._unseen = False
 
     def reset(self, pose: Floats, seed: int) -> Floats:
         """Arm if that is due and look; its measured pose (3,). On the twin somebody puts the block at ``pose`` first.
 
         Raises:
+            Stopped: the stop is latched; whatever waits here looks at it.
             BlockNotSeen: it does not show itself.
             DeviceError: the electronics cannot be brought up.
         """
+        self._unseen = False
+        self.hold()
         self.mover.ready()
         if self.lab.twin is not None:
             self.lab.twin.nudge(pose)
@@ -119,15 +124,23 @@ class HardwareBackend:
         """Of the twin: where the block truly is (3,). Of a real cell: where it was seen last."""
         return self._last.pose.copy() if self.lab.twin is None else self.lab.twin.true_pose()
 
-    def watch(self) -> Floats:
-        """Where the block lies (3,). One that no arm reaches is waited for, as long as there is patience."""
+    def watch(self) -> Floats | None:
+        """Where the block lies (3,). One that no arm reaches is waited for, as long as there is patience.
+
+        So is one that was out of sight after the last transfer; None if it still is.
+
+        Raises as :meth:`execute`.
+        """
         before, last_s = self._last
         if self.lab.driver.dry_run:
             return before.copy()
         if self.clock.now_s() - last_s > FRESH_S:
-            self._look()
-            if self._apart(before, self._last.pose):
-                self.log.add(Event.BLOCK_MOVED, was=before, pose=self._last.pose)
+            try:
+                self._moved_since(before)
+            except BlockNotSeen as lost:
+                if not (self._unseen and lost.camera_works):
+                    raise
+                return None
         if not self._reached():
             self._wait_for_reach()
         return self._last.pose.copy()
@@ -143,14 +156,12 @@ class HardwareBackend:
         refusal = self.check(arm, paths, self.joints_rad()[arm], before[:2])
         if refusal is not None:
             return Execution(before.copy(), self.joints_rad(), 0.0, refusal)
+        if self.hold() and self._moved_since(before):
+            return Execution(self._last.pose.copy(), self.joints_rad(), 0.0, Refusal.MISSED_GRASP)
         phases = timed_phases(welded(paths), self.model.arm, self.motion, self.model.cell.config.pick_height_mm)
         place = self.check.grip_mm(arm, paths.transfer[-1])[:2]
         self.log.add(Event.MOTION, arm=arm, phases=[[phase.name, float(phase.t_s[0]), float(phase.t_s[-1])] for phase in phases])
-        try:
-            played = self.mover.play(arm, phases, None if self.lab.driver.dry_run else self._block_watch(before))
-        except Stopped as stop:
-            self.log.add(Event.STOPPED, reason=stop.reason)
-            raise
+        played = self.mover.play(arm, phases, None if self.lab.driver.dry_run else self._block_watch(before))
         path_mm = self._length_mm(arm, phases)
         if self.lab.driver.dry_run:
             moved = carried(before, place, paths.transfer[-1, 0] - paths.transfer[0, 0])
@@ -161,7 +172,8 @@ class HardwareBackend:
         except BlockNotSeen as lost:
             if not lost.camera_works:
                 raise
-            return Execution(before.copy(), self.joints_rad(), path_mm, Refusal.TIPPED)
+            self._unseen = True
+            return Execution(before.copy(), self.joints_rad(), path_mm, Refusal.UNSEEN)
         failure = self._failure(arm, before, pose, place) if played else self._unplayed(before, pose, phases)
         return Execution(pose, self.joints_rad(), path_mm, failure)
 
@@ -199,9 +211,19 @@ class HardwareBackend:
         view = self.lab.watcher.look()
         if view.block is None:
             raise BlockNotSeen(view.camera_works, self.config.patience_s)
-        self._last = _Sighted(view.block, self.clock.now_s())
+        self._last, self._unseen = _Sighted(view.block, self.clock.now_s()), False
         self.log.add(Event.SEEN, pose=view.block, goal=view.goal)
         return view.block.copy()
+
+    def _moved_since(self, before: Floats) -> bool:
+        """Look; whether somebody moved the block from ``before`` (3,). In a dry run nobody looks."""
+        if self.lab.driver.dry_run:
+            return False
+        now = self._look()
+        if not self._apart(before, now):
+            return False
+        self.log.add(Event.BLOCK_MOVED, was=before, pose=now)
+        return True
 
     def _failure(self, arm: int, before: Floats, after: Floats, place_mm: Floats) -> Refusal | None:
         """What came of a motion that was played to its end."""
@@ -210,7 +232,7 @@ class HardwareBackend:
             self.log.add(Event.FAILED_GRASP, arm=arm, pose=after)
             if self._idle[arm] >= self.config.failures:
                 self.log.add(Event.ARM_STALLED, arm=arm)
-                return Refusal.DECLINED
+                return Refusal.STALLED
             return Refusal.MISSED_GRASP
         self._idle[arm] = 0
         if math.dist(after[:2], place_mm) > self.config.missed_mm:
@@ -235,7 +257,7 @@ class HardwareBackend:
         self.log.add(Event.BLOCK_OUTSIDE, pose=self._last.pose)
         end_s = self.clock.now_s() + self.config.patience_s
         while not self._reached() and self.clock.now_s() < end_s:
-            self.clock.sleep_s(10 * self.config.frame_s)
+            self.lab.driver.wait(10 * self.config.frame_s)
             self._look()
         if self._reached():
             self.log.add(Event.RECOVERED, what=Event.BLOCK_OUTSIDE)

@@ -22,6 +22,7 @@ from marl_handover.perception.tracker import Tracker
 from marl_handover.runtime.events import EventLog
 from marl_handover.runtime.play import FILE as PLAY_FILE
 from marl_handover.runtime.play import Play, half_bands_rad, load_play
+from marl_handover.runtime.servo_files import NAMES, SET_FILE, arm_file, require_one_set
 from marl_handover.runtime.settings import LabConfig
 from marl_handover.runtime.twin import Twin
 from marl_handover.runtime.watcher import Watcher
@@ -103,6 +104,8 @@ def open_lab(
     """
     folder = config.folder()
     seen_by = camera_calibration(folder)
+    own = [arm_file(arm) for arm in ARMS if not (arm in config.hardware.arms and config.hardware.arms[arm].calibration)]
+    require_one_set(folder, [*own, PLAY_FILE])
     half_us = load_play(folder)
     plugs = plug_in(config, model, motion, confirm)
     try:
@@ -113,7 +116,7 @@ def open_lab(
         )
         log = EventLog(plugs.clock.now_s, log_path)
         tracker = Tracker(Detector(seen_by, model.cell.config.block, config.target, config.detector), config.tracker)
-        watcher = Watcher(plugs.camera, tracker, plugs.clock, config.watch, log)
+        watcher = Watcher(plugs.camera, tracker, plugs.clock, config.watch, log, driver.wait)
     except BaseException:
         plugs.close()
         raise
@@ -122,7 +125,7 @@ def open_lab(
 
 def is_calibrated(folder: Path) -> bool:
     """Whether every file that ``calibrate`` writes is in ``folder``."""
-    return all((folder / name).is_file() for name in (CAMERA_FILE, PLAY_FILE, *(f"{arm}.json" for arm in ARMS)))
+    return all((folder / name).is_file() for name in (CAMERA_FILE, SET_FILE, *NAMES))
 
 
 def camera_calibration(folder: Path) -> CameraCalibration:
@@ -136,7 +139,7 @@ def camera_calibration(folder: Path) -> CameraCalibration:
 def calibrated(hardware: HardwareConfig, folder: Path) -> HardwareConfig:
     """The electronics with the arms' calibration files in ``folder``; a file that the settings name stays."""
     arms = {
-        name: wiring if wiring.calibration else replace(wiring, calibration=str(folder / f"{name}.json"))
+        name: wiring if wiring.calibration else replace(wiring, calibration=str(folder / arm_file(name)))
         for name, wiring in hardware.arms.items()
         if name in ARMS
     }

@@ -33,6 +33,9 @@ from marl_handover.task.rules import Outcome, Rules, Verdict
 Floats = NDArray[np.float64]
 Observer = Callable[[Transfer], None]
 
+HOPELESS = frozenset({Refusal.TIPPED, Refusal.STALLED})
+"""After these there is no use in another transfer."""
+
 REFUSED = Verdict(np.float64(-1.0), np.bool_(True), np.int64(Outcome.WRONG_POSITION))
 """Architecture A's verdict on a transfer that an arm refused."""
 
@@ -55,7 +58,8 @@ class ClosedLoop:
     The *first verdict* is the rule book's, at the first final placement (architecture B) or the first external finish (A), at
     ``max_steps`` transfers at the latest. A transfer that the arm or the backend refuses is a wrong position. After any other verdict than
     success the loop tries again, with the object where it lies, until the object is at the goal or ``settings.transfers`` are spent. It is
-    *stuck* if the object has tipped over, or if an order is refused and then given again about an object that has not moved.
+    *stuck* if the object has tipped over or stays out of sight, if an arm does nothing time and again, or if an order is refused and then
+    given again about an object that has not moved.
 
     Args:
         policy: the supervisor, under the rules that judge it.
@@ -112,8 +116,14 @@ class ClosedLoop:
             run.goal = goal
             if len(run.transfers) < self.limit:
                 run.ended = None
+            elif run.ended == "success" and not self._at_goal(run):
+                run.ended = "transfers"
         if run.ended is None and isinstance(self.backend, Watchful):
-            run.pose = self.backend.watch()
+            pose = self.backend.watch()
+            if pose is None:
+                run.ended = "stuck"
+            else:
+                run.pose = pose
         return run.ended is None
 
     def _decide(self, run: _Run) -> None:
@@ -217,7 +227,7 @@ class ClosedLoop:
     def _conclude(self, run: _Run) -> None:
         """End the attempt, or the episode, if that is due after a decision."""
         last, count = run.transfers[-1], len(run.transfers)
-        there = self._at_goal(run) and last.done.refusal != Refusal.TIPPED
+        there = self._at_goal(run) and last.done.refusal not in (Refusal.TIPPED, Refusal.UNSEEN)
         if run.attempt > 0 and there:
             last = replace(last, terminated=True, outcome=Outcome.SUCCESS)
         elif not last.terminated and count >= self._room(run):
@@ -225,7 +235,7 @@ class ClosedLoop:
         run.transfers[-1] = last
         if there and last.over:
             run.ended = "success"
-        elif last.done.refusal == Refusal.TIPPED or (run.attempt > 0 and last.repeats(run.transfers[-2], *self._same)):
+        elif last.done.refusal in HOPELESS or (run.attempt > 0 and last.repeats(run.transfers[-2], *self._same)):
             run.ended = "stuck"
         elif count >= self.limit:
             run.ended = "transfers"

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.errors import BadReply, BoardReset, DeviceError, NotConfirmed, PortLost, Stalled, Stopped, WrongState
 from marl_handover.hardware.gate import GateRejection
 from marl_handover.hardware.session import State
@@ -26,7 +25,6 @@ _ASTRAY_S = 0.2
 """Boards may be so far before or behind the host's idea of a motion: a move may have been written and lost, or done and not noted."""
 
 _RETRY_S = 0.5
-_REJOIN_MS, _HALF_READING_US = 200, 5
 _COMMITTED_S = 0.25
 """So long before the hand is at the pin it goes on, whatever is seen: it hides the block."""
 
@@ -155,10 +153,8 @@ class Mover:
         begun_s = self.lab.clock.now_s()
         self.driver.reconnect()
         try:
-            held = _rejoin(self.driver)
-        except (BoardReset, BadReply, PortLost):
-            held = False
-        if not held:
+            self.driver.rejoin()
+        except (BoardReset, BadReply, PortLost, GateRejection):
             self.log.add(Event.CONTROLLER_RESET, text="after the port was lost")
             return False
         self.log.add(Event.RECOVERED, what=Event.SERIAL_LOST, after_s=self.lab.clock.now_s() - begun_s)
@@ -188,27 +184,6 @@ class Mover:
                 self.driver.limp()
             self._start_over()
         return False
-
-
-def _rejoin(driver: ArmDriver) -> bool:
-    """Take the arms where the boards hold them, all of them; False if a board has forgotten any.
-
-    Each channel is sent where it is, to 10 us: that is the first move which a board that was just connected wants to see.
-    """
-    held = driver.boards.pulses()
-    if any(pulse is None for pulses in held.values() for pulse in pulses.values()):
-        return False
-    driver.obey()
-    where = {name: {channel: (pulse or 0) + _HALF_READING_US for channel, pulse in pulses.items()} for name, pulses in held.items()}
-    driver.boards.first_move(where, _REJOIN_MS)
-    driver.wait(_REJOIN_MS / 1000)
-    driver.state = State.STOPPED
-    try:
-        driver.resume()
-    except DeviceError:
-        driver.state = State.CONFIGURED if driver.state is State.STOPPED else driver.state
-        raise
-    return True
 
 
 def _rest(phases: Sequence[Phase], reached_s: float, joints_rad: Floats) -> Phase:

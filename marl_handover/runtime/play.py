@@ -2,7 +2,7 @@
 
 A servo rests half its dead band short of where it is sent, on the side it came from: 4 us, or 0.4 degrees, that put a hand 2 mm off. It
 is play, and play has an exact inverse: aim half the band further in the direction of motion, and let the aim jump by the whole band when
-the direction turns. The width of the band is found by :mod:`~marl_handover.runtime.servo_calibration`.
+the direction turns. The width of each servo's band is found by :mod:`~marl_handover.runtime.servo_calibration`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import require_between
 from marl_handover.errors import CorruptFile, MissingFile
 from marl_handover.files import write_whole
@@ -24,7 +25,7 @@ from marl_handover.motion.trajectory import Phase
 
 Floats = NDArray[np.float64]
 
-VERSION = 1
+VERSION = 2
 FILE = "play.json"
 MOST_US = 20.0
 _STILL_RAD = 1e-6
@@ -35,7 +36,8 @@ class Play:
 
     Args:
         half_band_rad: (num_arms, 5) half the dead band of each joint's servo.
-        lower_rad, upper_rad: (5,) limits that the aims keep to.
+        lower_rad: (5,) lower limits that the aims keep to.
+        upper_rad: (5,) upper ones.
     """
 
     def __init__(self, half_band_rad: Floats, lower_rad: Floats, upper_rad: Floats) -> None:
@@ -68,29 +70,38 @@ class Play:
         return way * self._half[arm]
 
 
-def half_bands_rad(half_us: Mapping[str, float], calibrations: Sequence[ArmCalibration]) -> Floats:
-    """(num_arms, 5) in rad of half dead bands given in us, arm by arm."""
-    return np.array([[half_us[arm] / servo.us_per_rad() for servo in it.maps] for arm, it in zip(ARMS, calibrations, strict=True)])
+def half_bands_rad(half_us: Mapping[str, ArrayLike], calibrations: Sequence[ArmCalibration]) -> Floats:
+    """(num_arms, 5) in rad of half dead bands (5,) given in us, arm by arm."""
+    scales = np.array([[servo.us_per_rad() for servo in calibration.maps] for calibration in calibrations])
+    return np.array([half_us[arm] for arm in ARMS], float) / scales
 
 
-def save_play(folder: Path, half_us: Mapping[str, float]) -> None:
-    """Write half the dead band in us, of each arm's servos, into ``folder``."""
+def save_play(folder: Path, half_us: Mapping[str, ArrayLike], sd_us: Mapping[str, ArrayLike]) -> None:
+    """Write half the dead bands (5,) in us of each arm's servos, and their standard deviations (5,), into ``folder``."""
+
+    def listed(values: Mapping[str, ArrayLike]) -> dict[str, dict[str, float]]:
+        rows = {arm: np.round(np.asarray(values[arm], float), 3).tolist() for arm in ARMS}
+        return {arm: dict(zip(ARM_JOINTS, row, strict=True)) for arm, row in rows.items()}
+
+    content = {"version": VERSION, "half_band_us": listed(half_us), "half_band_sd_us": listed(sd_us)}
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / FILE, json.dumps({"version": VERSION, "half_band_us": dict(half_us)}, indent=1) + "\n")
+    write_whole(folder / FILE, json.dumps(content, indent=1) + "\n")
 
 
-def load_play(folder: Path) -> dict[str, float]:
-    """What :func:`save_play` wrote. Raises :class:`MissingFile` or :class:`CorruptFile`."""
+def load_play(folder: Path) -> dict[str, Floats]:
+    """Half the dead bands (5,) in us, by arm. Raises :class:`MissingFile`, :class:`CorruptFile` or :class:`InvalidSetting`."""
     path = folder / FILE
     if not path.is_file():
         raise MissingFile("play of the servos", path, "run: marl-handover calibrate what=servos")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["version"] != VERSION:
-            raise CorruptFile("play of the servos", path, f"it has version {content['version']!r}, this program reads {VERSION}")
-        found = {arm: float(content["half_band_us"][arm]) for arm in ARMS}
-        for arm, value in found.items():
-            require_between(f"half_band_us.{arm}", value, 0.0, MOST_US)
+            why = f"it has version {content['version']!r}, this program reads {VERSION}, a band for each joint"
+            raise CorruptFile("play of the servos", path, f"{why}; run: marl-handover calibrate what=servos")
+        found = {arm: np.array([float(content["half_band_us"][arm][joint]) for joint in ARM_JOINTS]) for arm in ARMS}
+        for arm, values in found.items():
+            for joint, value in zip(ARM_JOINTS, values, strict=True):
+                require_between(f"half_band_us.{arm}.{joint}", float(value), 0.0, MOST_US)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise CorruptFile("play of the servos", path, f"{type(error).__name__}: {error}") from error
     return found

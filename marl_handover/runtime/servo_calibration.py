@@ -1,7 +1,7 @@
 """``calibrate what=servos``: every arm goes through some forty postures with a marker on its hand, and the camera says where that was.
 
-Zero and scale of all five servos follow from all sightings at once (:mod:`~marl_handover.hardware.identify`), and so does the width of the
-dead band: each joint comes to each posture from one side or the other, by lot, and rests short of it on that side.
+Zero and scale of all five servos follow from all sightings at once (:mod:`~marl_handover.hardware.identify`), and so do the widths of their
+dead bands: each joint comes to each posture from one side or the other, by lot, and rests short of it on that side.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.cell.build import CellModel
 from marl_handover.cell.kinematics import transform
 from marl_handover.hardware.calibration import ArmCalibration, CalibrationProblem
 from marl_handover.hardware.driver import ArmDriver
@@ -37,7 +36,6 @@ _HIGH = np.radians([60.0, 125.0, -114.0, 90.0, 35.0])
 _HEIGHT_MM, _RADIUS_MM = (65.0, 190.0), (130.0, 205.0)
 _FACING_UP = math.cos(math.radians(40.0))
 _MARGIN_PX = 60.0
-_FURTHEST_BAND_US, _BAND_STEP_US = 8.0, 1.0
 _SIGHT_SD_MM, _YAW_SD_DEG = 0.6, 1.0
 _TYPICAL_HEIGHT_MM = 110.0
 _OPENING_PX = 3
@@ -51,12 +49,18 @@ class Posture(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What came of an arm: its calibration, half the dead band in us, the residual in mm, and how many sightings it rests on."""
+    """What came of an arm: its calibration, its dead bands, the residual in mm, and how many sightings it rests on.
+
+    ``half_band_us`` (5,) is half the dead band of each servo, ``half_band_sd_us`` (5,) how sure that is: a standard deviation.
+    ``joint_sd_deg`` (5,) is the same of each joint's angle in the middle of the postures.
+    """
 
     calibration: ArmCalibration
-    half_band_us: float
+    half_band_us: Floats
+    half_band_sd_us: Floats
     residual_mm: float
     sightings: int
+    joint_sd_deg: Floats
 
 
 class ServoCalibration:
@@ -95,7 +99,7 @@ class ServoCalibration:
             CalibrationProblem: the marker was seen too seldom, or no servo explains what was seen.
             GateRejection, Stopped, BoardReset, PortLost, BadReply: as :meth:`ArmDriver.move`.
         """
-        sightings: list[tuple[Sighting, Floats]] = []
+        sightings: list[Sighting] = []
         for posture in self._postures(arm):
             sightings += self._sight(arm, posture)
         self.driver.drive(arm, self.driver.parked_rad, self.driver.gripper_mm(arm), _SPEED_DEG_S)
@@ -104,15 +108,12 @@ class ServoCalibration:
                 ARMS[arm], f"the marker on its hand was seen in {len(sightings) // 4} of {self.count} postures; is it glued on, is it lit?"
             )
         before = self.driver.calibrations[arm]
-        model = self.driver.model
-        bands = np.arange(0.0, _FURTHEST_BAND_US + 1e-9, _BAND_STEP_US)
-        residuals = np.array([_identified(model, before, sightings, band)[1] for band in bands])
-        half = _lowest(bands, residuals)
-        calibration, residual = _identified(model, before, sightings, half)
-        return Measured(calibration, half, residual, len(sightings) // 4)
+        found = identify(self.driver.model, before, sightings, position_sd_mm=_SIGHT_SD_MM, yaw_sd_deg=_YAW_SD_DEG)
+        seen = len(sightings) // 4
+        return Measured(found.calibration, found.half_band_us, found.half_band_sd_us, found.residual_mm, seen, found.joint_sd_deg)
 
-    def _sight(self, arm: int, posture: Posture) -> list[tuple[Sighting, Floats]]:
-        """The four corners of the marker at a posture, each with the sides its joints came from; none if it is not seen."""
+    def _sight(self, arm: int, posture: Posture) -> list[Sighting]:
+        """The four corners of the marker at a posture; none if it is not seen."""
         fingers = self.driver.gripper_mm(arm)
         try:
             for joints in (posture.joints_rad - posture.side * _SIDE_RAD, posture.joints_rad):
@@ -128,8 +129,10 @@ class ServoCalibration:
         if found is None:
             return []
         camera_mm = _triple(self.seen_by.eye_mm())
+        way = np.sign([float(servo.to_us(1.0)) - float(servo.to_us(0.0)) for servo in self.driver.calibrations[arm].maps])
+        came = tuple((posture.side * way).tolist())
         return [
-            (Sighting(pulses, at, camera_mm=camera_mm, plane_mm=0.0, point_mm=_triple(corner)), posture.side)
+            Sighting(pulses, at, camera_mm=camera_mm, plane_mm=0.0, point_mm=_triple(corner), came=came)
             for at, corner in zip(self.seen_by.on_plane(found.pixels, 0.0), self._corners_mm, strict=True)
         ]
 
@@ -167,23 +170,6 @@ class ServoCalibration:
         except GateRejection:
             return False
         return True
-
-
-def _identified(
-    model: CellModel, before: ArmCalibration, sightings: list[tuple[Sighting, Floats]], half_us: float
-) -> tuple[ArmCalibration, float]:
-    """Calibration and residual if each servo rests ``half_us`` short of its pulse."""
-    way = np.sign([float(servo.to_us(1.0)) - float(servo.to_us(0.0)) for servo in before.maps])
-    rested = [sighting._replace(pulses_us=sighting.pulses_us - side * way * half_us) for sighting, side in sightings]
-    found = identify(model, before, rested, position_sd_mm=_SIGHT_SD_MM, yaw_sd_deg=_YAW_SD_DEG)
-    return found.calibration, found.residual_mm
-
-
-def _lowest(x: Floats, y: Floats) -> float:
-    """Where the parabola through the lowest value and its neighbours is lowest."""
-    index = int(np.clip(np.argmin(y), 1, len(x) - 2))
-    curve = np.polyfit(x[index - 1 : index + 2], y[index - 1 : index + 2], 2)
-    return float(np.clip(-curve[1] / (2 * curve[0]), x[0], x[-1])) if curve[0] > 0 else float(x[np.argmin(y)])
 
 
 def _short_tour(postures: list[Posture], start_rad: Floats) -> list[Posture]:

@@ -11,10 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.errors import WorkFailed
+from marl_handover.hardware.errors import Stopped
 from marl_handover.runtime.episode import Episode, Transfer
 from marl_handover.runtime.events import Event, EventLog
 from marl_handover.runtime.hardware_backend import HardwareBackend
 from marl_handover.runtime.loop import ClosedLoop
+from marl_handover.runtime.steering import Desk
 from marl_handover.runtime.trace import transfer_row
 
 Floats = NDArray[np.float64]
@@ -44,7 +46,7 @@ class GivenGoal:
 
 
 class PrintedGoal:
-    """The goal is wherever the printed marker was seen last; one that is covered stays where it was.
+    """The goal is wherever the printed marker was seen last; one that is covered stays where it was, from one episode to the next too.
 
     Sightings within ``same_mm`` and ``same_rad`` are of a marker that has not moved.
     """
@@ -52,6 +54,10 @@ class PrintedGoal:
     def __init__(self, backend: HardwareBackend, same_mm: float = 3.0, same_rad: float = 0.05) -> None:
         self._backend, self._same_mm, self._same_rad = backend, same_mm, same_rad
         self._goal: Floats | None = None
+
+    def forget(self) -> None:
+        """Somebody has laid the marker elsewhere: from now on it has to be seen again."""
+        self._goal = None
 
     def __call__(self) -> Floats:
         """The goal (3,). Raises :class:`NoGoal` if it was never seen."""
@@ -74,13 +80,17 @@ class Session:
     Args:
         loop: around a :class:`HardwareBackend`.
         about: goes into the log's first line.
+        desk: where somebody may lay wishes: to pause, to go on, another goal. None: nobody can.
     """
 
-    def __init__(self, loop: ClosedLoop, about: dict[str, Any]) -> None:
+    def __init__(self, loop: ClosedLoop, about: dict[str, Any], desk: Desk | None = None) -> None:
         if not isinstance(loop.backend, HardwareBackend):
             raise TypeError("a session needs arms and a camera, real or the twin's")
         self.loop, self.backend = loop, loop.backend
+        self.desk, self.backend.hold = desk or Desk(), self._hold
         self.log: EventLog = self.backend.log
+        self.printed = PrintedGoal(self.backend)
+        """The printed marker, of all episodes."""
         rules = loop.rules
         parked = self.backend.check.parked_rad
         self.log.add(
@@ -100,7 +110,8 @@ class Session:
         asked: list[Floats] = []
 
         def current() -> Floats:
-            goal = goals()
+            self._hold()
+            goal = goals() if self.desk.goal is None else self.desk.goal
             if not asked or np.abs(goal - asked[-1]).max() > 0:
                 self.log.add(Event.GOAL_CHANGED if asked else Event.GOAL, goal=goal)
                 asked.append(goal)
@@ -108,10 +119,30 @@ class Session:
 
         self.log.add(Event.EPISODE, seed=seed)
         # A printed goal shows itself at the first look, which play() takes before it asks.
-        episode = self.loop.play(np.asarray(start, float), np.full(3, np.inf), seed, self._note, current)
+        try:
+            episode = self.loop.play(np.asarray(start, float), np.full(3, np.inf), seed, self._note, current)
+        except Stopped as stop:
+            self.log.add(Event.STOPPED, reason=stop.reason)
+            raise
         outcome = episode.outcome.name.lower()
+        self.desk.goal = None  # the next episode has its own
         self.log.add(Event.ENDED, ended=episode.ended, outcome=outcome, transfers=len(episode.transfers), goal=episode.goal)
         return episode
+
+    def _hold(self) -> bool:
+        """Wait for as long as somebody wants no transfer to begin; whether anybody did. Raises :class:`Stopped`."""
+        self._answer()
+        if not self.desk.paused:
+            return False
+        self.log.add(Event.PAUSED)
+        self.desk.wait(self.backend.lab.driver.obey)
+        self._answer()
+        self.log.add(Event.RESUMED)
+        return True
+
+    def _answer(self) -> None:
+        for answer in self.desk.answers():
+            self.log.add(Event.CONTROL, **answer._asdict())
 
     def _note(self, transfer: Transfer) -> None:
         self.log.add(Event.TRANSFER, **transfer_row(transfer, self.loop.rules))

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 from marl_handover.compose import from_yaml
 from marl_handover.config import require_at_least, require_between, require_positive
 from marl_handover.errors import InvalidSetting
-from marl_handover.hardware.settings import HardwareConfig
+from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.perception.settings import (
+    MARKERS,
     BoardConfig,
     CameraConfig,
     DetectorConfig,
@@ -22,12 +26,16 @@ from marl_handover.resources import resource_path
 
 TWIN = "twin"
 
+_RENDERED = ("width_px", "height_px", "max_age_s")
+"""What a drawn picture has of a camera's settings."""
+
 
 @dataclass
 class WatchConfig:
     """When a sighting is taken for where the block lies, and how long anything is waited for."""
 
     frame_s: float = 1 / 30  # between two looks
+    picture_s: float = 0.5  # no new picture for this long: the camera gives none
     steady_frames: int = 4  # sightings in a row that agree; so many that a frozen camera has shown itself by then
     steady_mm: float = 0.6
     steady_deg: float = 0.8
@@ -41,7 +49,7 @@ class WatchConfig:
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` on a value out of its limits."""
-        for name in ("frame_s", "steady_mm", "steady_deg", "hidden_s", "glance_s", "moved_mm", "moved_deg", "missed_mm"):
+        for name in ("frame_s", "picture_s", "steady_mm", "steady_deg", "hidden_s", "glance_s", "moved_mm", "moved_deg", "missed_mm"):
             require_positive(f"watch.{name}", getattr(self, name))
         require_between("watch.steady_frames", self.steady_frames, 1, 100)
         require_between("watch.patience_s", self.patience_s, self.hidden_s, 3600)
@@ -72,6 +80,16 @@ class CardConfig:
     marker_mm: float = 30.0
     place_mm: list[float] = field(default_factory=lambda: [-47.0, 0.0, 13.2])  # its middle: flat on the hand, x along the fingers
 
+    def validate(self, target: TargetConfig) -> None:
+        """Raise :class:`InvalidSetting` on a value out of its limits, or a marker that means something else in ``target``."""
+        count, taken = MARKERS[target.dictionary], {target.block_id, target.goal_id}
+        if len(self.ids) != len(ARMS) or len({*self.ids} - taken) != len(ARMS) or not all(0 <= number < count for number in self.ids):
+            wanted = f"two different numbers from 0 to {count - 1} that are neither target.block_id nor target.goal_id"
+            raise InvalidSetting("cards.ids", self.ids, wanted)
+        require_positive("cards.marker_mm", self.marker_mm)
+        if len(self.place_mm) != 3 or not all(math.isfinite(value) for value in self.place_mm):
+            raise InvalidSetting("cards.place_mm", self.place_mm, "three finite numbers")
+
 
 @dataclass
 class LabConfig:
@@ -101,16 +119,31 @@ class LabConfig:
         return Path(self.calibration or f"runs/calibration/{self.hardware.name}")
 
     def validate(self) -> None:
-        """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
+        """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits, or one that this cell does not use."""
         for part in (self.hardware, self.board, self.target, self.detector, self.tracker, self.watch, self.mount, self.look, self.twin):
             part.validate()
+        self.cards.validate(self.target)
         require_between("chart_inset", self.chart_inset, 0.1, 1)
         if self.watch.steady_frames < self.tracker.frozen_frames:
             raise InvalidSetting(
                 "watch.steady_frames", self.watch.steady_frames, f"at least tracker.frozen_frames = {self.tracker.frozen_frames}"
             )
-        if not self.emulated:
+        if self.emulated:
+            replace(self.camera, source="rendered").validate()
+            used = _RENDERED if self.camera.source != "rendered" else (*_RENDERED, "source")
+            _require_unused("camera", self.camera, CameraConfig(), used, "the twin: its pictures are drawn")
+        else:
             self.camera.validate()
+            for name, usual in (("mount", MountConfig()), ("look", LookConfig()), ("twin", TwinConfig())):
+                _require_unused(name, getattr(self, name), usual, (), "a real cell: it is of the twin")
+
+
+def _require_unused(name: str, given: Any, usual: Any, used: Sequence[str], by: str) -> None:
+    """Raise :class:`InvalidSetting` for a setting of ``given``, apart from those ``used``, that is not as ``usual``."""
+    for part in fields(given):
+        value = getattr(given, part.name)
+        if part.name not in used and value != getattr(usual, part.name):
+            raise InvalidSetting(f"{name}.{part.name}", value, f"left out with {by}")
 
 
 def twin_lab() -> LabConfig:

@@ -17,8 +17,8 @@ class Watchful(Protocol):
     same: tuple[float, float]
     """Poses nearer than this, in mm and rad, are the same as far as it can measure."""
 
-    def watch(self) -> Floats:
-        """Where the object lies now (3,)."""
+    def watch(self) -> Floats | None:
+        """Where the object lies now (3,); None if it has been out of sight since the last transfer, for longer than there is patience."""
 
 
 @runtime_checkable

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.cell.cell import Cell
 from marl_handover.config import require_at_least
 from marl_handover.simulation.engine import Engine, length, pybullet
 
@@ -14,7 +15,7 @@ Pixels = NDArray[np.uint8]
 
 
 class Camera(NamedTuple):
-    """A pinhole camera. ``focal_px`` is for a picture ``width_px`` wide; other sizes see the same width of table."""
+    """A pinhole camera. ``focal_px`` is for a picture ``width_px`` wide; one of another shape shows all of that, and more on two sides."""
 
     eye_mm: tuple[float, float, float]
     target_mm: tuple[float, float, float]
@@ -27,8 +28,24 @@ class Camera(NamedTuple):
 TOP = Camera((0.0, 0.0, 700.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 917.0)
 """The cell's own: straight down on the origin. World x is up in the picture, world y points left."""
 
-OVERVIEW = Camera((-760.0, 0.0, 520.0), (0.0, 0.0, 90.0), (0.0, 0.0, 1.0), 1450.0)
-"""For people: from the side, both arms in view, the left one on the left."""
+VIEWS = ("overview", "top")
+
+_OVERVIEW = Camera((-560.0, 0.0, 560.0), (-30.0, 0.0, 75.0), (0.0, 0.0, 1.0), 1330.0, height_px=832)
+_OVERVIEW_REACH_MM = 230.0
+
+
+def view(name: str, cell: Cell) -> Camera:
+    """The camera of that name, of :data:`VIEWS`: top, the cell's own; or overview.
+
+    The overview is for people: from the side, both arms and all that they reach in view, the left one on the left. It stands farther off
+    where arms reach farther.
+    """
+    if name == "top":
+        return TOP
+    farther = max(1.0, cell.r_max_mm / _OVERVIEW_REACH_MM)
+    (eye_x, eye_y, eye_z), (x, y, z) = _OVERVIEW.eye_mm, _OVERVIEW.target_mm
+    return _OVERVIEW._replace(eye_mm=(farther * eye_x, eye_y, farther * eye_z), target_mm=(farther * x, y, z))
+
 
 _NEAR_MM, _FAR_MM = 50.0, 3000.0
 _LIGHT = (0.4, -0.3, 1.0)
@@ -39,8 +56,8 @@ def picture(engine: Engine, camera: Camera, width: int, height: int) -> Pixels:
     require_at_least("width", width, 1)
     require_at_least("height", height, 1)
     eye, target = ([length(value) for value in point] for point in (camera.eye_mm, camera.target_mm))
-    half_width = length(_NEAR_MM) * camera.width_px / (2 * camera.focal_px)
-    half_height = half_width * height / width
+    pixel = length(_NEAR_MM) / camera.focal_px * max(camera.width_px / width, camera.height_px / height)
+    half_width, half_height = pixel * width / 2, pixel * height / 2
     _, _, pixels, _, _ = pybullet.getCameraImage(
         width,
         height,

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import tomllib
 from pathlib import Path
 
+import pytest
+import serial
 from packaging.requirements import Requirement
 
+from marl_handover.cli import main
 from marl_handover.commands import doctor
+from marl_handover.hardware import ports, roll, settings
+from marl_handover.hardware.emulator.board import Board
+from marl_handover.hardware.emulator.device import Device
+from marl_handover.hardware.emulator.pty import PtyEmulator
+from marl_handover.hardware.latch import StopLatch
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
@@ -35,3 +45,77 @@ def test_packages_of_an_extra_that_are_missing_are_named_with_the_line_that_inst
     doctor.run(doctor.DoctorConfig())
     assert "[more]" in (out := capsys.readouterr().out)
     assert "missing no-such-package; run: pip install 'marl_handover[more]'" in out
+
+
+@pytest.fixture
+def board(tmp_path):
+    """``board(baud)``: the path of a port with an emulated controller behind it."""
+    running = []
+
+    def make(baud=115200):
+        emulator, over = PtyEmulator(Device(Board(), baud=baud), tmp_path / f"ssc32-{baud}"), threading.Event()
+        thread = threading.Thread(target=emulator.serve, args=(over.is_set,))
+        thread.start()
+        running.append((emulator, over, thread))
+        return emulator
+
+    yield make
+    for emulator, over, thread in running:
+        over.set()
+        thread.join()
+        emulator.close()
+
+
+def test_a_controller_that_is_asked_says_who_it_is_and_at_which_rate(board, capsys):
+    fast, slow = board(), board(9600)
+    assert main(["doctor", f"port={fast.link}"]) == 0
+    assert f"{fast.link}: SSC32-V2.50USB at 115200 baud\n" in capsys.readouterr().out
+    assert main(["doctor", f"port={slow.link}"]) == 0
+    assert "SSC32-V2.50USB at 9600 baud; too slow" in capsys.readouterr().out
+    assert not [line for _, line in fast.device.lines if not line.endswith(b"VER\r")], "it is asked who it is, and nothing else"
+
+
+def test_a_port_that_is_not_there_or_in_use_is_said_to_be(board, tmp_path, capsys):
+    assert main(["doctor", f"port={tmp_path / 'none'}"]) == 0
+    assert "cannot be opened" in capsys.readouterr().out
+    link = board().link
+    with serial.Serial(str(link), exclusive=True):
+        assert main(["doctor", f"port={link}"]) == 0
+    assert "cannot be opened" in capsys.readouterr().out
+
+
+def test_ports_are_asked_only_if_that_is_wanted(board, monkeypatch, capsys):
+    emulator = board()
+    monkeypatch.setattr(ports, "list_serial_ports", lambda: [ports.PortInfo(str(emulator.link), "FT232R", True)])
+    main(["doctor"])
+    out = capsys.readouterr().out
+    assert f"{emulator.link}  FT232R, may be a controller" in out
+    assert "doctor ask=true" in out
+    assert not emulator.device.lines
+    main(["doctor", "ask=true"])
+    assert "SSC32-V2.50USB at 115200 baud" in capsys.readouterr().out
+
+
+def test_the_latched_stop_and_running_sessions_are_named(tmp_path, monkeypatch, capsys):
+    for module in (roll, settings):
+        monkeypatch.setattr(module, "user_path", lambda suffix: tmp_path / f"user{suffix}")
+    latch = StopLatch(settings.HardwareConfig().stop_path())
+    latch.join()
+    main(["doctor"])
+    out = capsys.readouterr().out
+    assert "no stop is latched" in out
+    assert f"process {os.getpid()}" in out
+    latch.latch("smoke")
+    latch.leave()
+    main(["doctor"])
+    out = capsys.readouterr().out
+    assert "the stop is latched (smoke)" in out
+    assert f"process {os.getpid()}" not in out
+
+
+def test_the_latency_of_a_usb_chip(tmp_path, monkeypatch):
+    monkeypatch.setattr(ports, "_USB_SERIAL", tmp_path)
+    (tmp_path / "ttyUSB7").mkdir()
+    (tmp_path / "ttyUSB7" / "latency_timer").write_text("16\n")
+    assert ports.latency_ms("/dev/ttyUSB7") == 16
+    assert ports.latency_ms("/dev/ttyUSB8") is None

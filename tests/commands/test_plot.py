@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import matplotlib.image
 import numpy as np
@@ -40,10 +41,11 @@ def evaluation(tmp_path):
         "outcomes": {"success": 1, "wrong_orientation": 0, "wrong_position": 0, "timeout": 1},
     }  # fmt: skip
     rows = [
-        {"episode": 0, "state": [-120, -60, 0], "goal": [150, 60, 0.0], "outcome": None},
-        {"episode": 0, "state": [0, 0, 0], "goal": [150, 60, 0.0], "outcome": "success"},
-        {"episode": 1, "state": [-120, -60, 0], "goal": [150, 60, 1.5], "outcome": "timeout"},
+        {"episode": 0, "state": [-120, -60, 0], "goal": [150, 60, 0.0], "outcome": None, "arm": "R", "next_state": [0, 0, 0.3]},
+        {"episode": 0, "state": [0, 0, 0.3], "goal": [150, 60, 0.0], "outcome": "success", "arm": "L", "next_state": [150, 60, 0.02]},
+        {"episode": 1, "state": [-120, -60, 0], "goal": [150, 60, 1.5], "outcome": "timeout", "arm": "R", "next_state": [0, 0, 0.3]},
     ]
+    rows = [{**row, "final": row["outcome"] == "success", "epsilon_rad": 0.087} for row in rows]
     (tmp_path / "evaluation.json").write_text(json.dumps(result))
     (tmp_path / "trace.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return tmp_path / "evaluation.json", tmp_path / "trace.jsonl"
@@ -111,10 +113,57 @@ def test_a_trace_of_something_else(evaluation, capsys):
         assert said in capsys.readouterr().err
 
 
+def test_errors_and_confusion_of_a_trace(evaluation, tmp_path, capsys):
+    _, trace = evaluation
+    for arguments, name in (
+        (["kind=errors"], "trace_errors.png"),
+        (["kind=errors", "scale=linear", "symmetry_order=4", f"out={tmp_path}/linear.pdf"], "linear.pdf"),
+        (["kind=confusion"], "trace_confusion.png"),
+    ):
+        assert cli.main(["plot", f"trace={trace}", *arguments]) == 0
+        assert capsys.readouterr().out == f"written: {tmp_path}/{name}\n"
+    assert colours(tmp_path / "trace_errors.png") > 20
+    assert colours(tmp_path / "trace_confusion.png") > 20
+    assert cli.main(["plot", "kind=confusion", f"trace=[{trace},{trace}]", f"out={tmp_path / 'both.png'}"]) == 0
+    assert colours(tmp_path / "both.png") > 20
+    trace.write_text(trace.read_text().replace("150, 60", "-300, 200"))
+    assert cli.main(["plot", "kind=confusion", f"trace={trace}"]) == 2
+    assert "must be the cell of the trace" in capsys.readouterr().err
+
+
+def test_motions_as_plan_drew_them(tmp_path, capsys):
+    files = [f"motion={tmp_path / 'motion.json'}", f"motion_picture={tmp_path / 'same.png'}"]
+    assert cli.main(["plan", "start=[-120,60,0]", "goal=[60,0,-60]", "arm_motion.arm_clearance_mm=8", *files]) == 0
+    assert cli.main(["plot", "kind=motion", f"json={tmp_path / 'motion.json'}"]) == 0
+    # The file holds the cell's settings and the planner's.
+    np.testing.assert_array_equal(matplotlib.image.imread(tmp_path / "motion.png"), matplotlib.image.imread(tmp_path / "same.png"))
+    assert cli.main(["plot", "kind=motion", f"json={tmp_path / 'motion.json'}", "cell=al5a"]) == 2
+    assert "must be the cell of the motions" in capsys.readouterr().err
+
+
+def test_a_suites_figures(tmp_path, capsys):
+    stored = Path(__file__).parents[2] / "bench" / "results" / "compare" / "variants"
+    (tmp_path / "suite").mkdir()
+    results = json.loads((stored / "results.json").read_text())
+    results["figures"] = [spec for spec in results["figures"] if spec["name"] in ("learning", "success")]
+    results["figures"].append({**results["figures"][0], "name": "nothing", "rows": ["nobody"]})
+    (tmp_path / "suite" / "results.json").write_text(json.dumps(results))
+    assert cli.main(["plot", "kind=compare", f"suite={tmp_path / 'suite'}"]) == 0
+    assert "no values yet: nothing" in capsys.readouterr().out
+    names = sorted(path.name for path in (tmp_path / "suite" / "figures").iterdir())
+    assert names == ["learning.pdf", "learning.png", "success.pdf", "success.png"]
+    assert cli.main(["plot", "kind=compare", f"suite={tmp_path / 'suite'}", "figure=success", f"out={tmp_path / 'one.png'}"]) == 0
+    whole = matplotlib.image.imread(tmp_path / "suite" / "figures" / "success.png")
+    np.testing.assert_array_equal(matplotlib.image.imread(tmp_path / "one.png"), whole)
+    for figure, said in (("nothing", "must be one that has values already"), ("none", "choose one of: learning, success, nothing")):
+        assert cli.main(["plot", "kind=compare", f"suite={tmp_path / 'suite'}", f"figure={figure}"]) == 2
+        assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["kind=runs"], "kind = 'runs' is not known; choose one of: run, workspace, plan, evaluation"),
+        (["kind=runs"], "kind = 'runs' is not known; choose one of: run, workspace, plan, motion, evaluation, errors, confusion, compare"),
         ([], "run = '': must be a run directory"),
         (["run=[]"], "run = '[]': must be a run directory"),
         (["run=none"], "run directory not found: none"),
@@ -127,6 +176,21 @@ def test_a_trace_of_something_else(evaluation, capsys):
         (["kind=evaluation", "json=empty.json"], "evaluation empty.json cannot be read: it lacks 'outcomes'"),
         (["kind=evaluation", "json=broken/metrics.csv"], "evaluation broken/metrics.csv cannot be read"),
         (["run=broken", "colour=red"], "unknown key 'colour'"),
+        (["kind=motion"], "json = '': must be the file that `marl-handover plan motion=FILE` wrote"),
+        (["kind=motion", "json=none.json"], "motion not found: none.json"),
+        (["kind=motion", "json=empty.json"], "motion empty.json cannot be read: it lacks 'transfers'"),
+        (["kind=errors"], "trace = '': must be a file that `marl-handover evaluate trace=FILE` wrote"),
+        (["kind=errors", "trace=[a,b]"], "trace = '[a,b]': must be a file that"),
+        (["kind=errors", "trace=none"], "trace not found: none"),
+        (["kind=errors", "trace=broken/metrics.csv"], "trace broken/metrics.csv cannot be read: line 1 is no step"),
+        (["kind=errors", "trace=none", "scale=cubic"], "scale = 'cubic' is not known"),
+        (["kind=errors", "trace=none", "symmetry_order=0"], "symmetry_order = 0"),
+        (["kind=confusion"], "or two of the same problems, trace=[A,B]"),
+        (["kind=confusion", "trace=[a,b,c]"], "or two of the same problems"),
+        (["kind=compare"], "suite = '': must be a folder that `marl-handover compare` wrote"),
+        (["kind=compare", "suite=broken"], "results of a suite not found: broken/results.json"),
+        (["kind=compare", "suite=suite"], "results of a suite suite/results.json cannot be read"),
+        (["kind=compare", "suite=suite", "figure=a", "out=a.doc"], "out = 'a.doc': must be a file that ends in"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, said):
@@ -134,6 +198,8 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, said):
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "metrics.csv").write_text(HEADER + "\n1,2,3,x,5,6\n")
     (tmp_path / "empty.json").write_text("{}")
+    (tmp_path / "suite").mkdir()
+    (tmp_path / "suite" / "results.json").write_text('{"figures": [{"name": "a", "kind": "bars"}]}')
     before = sorted(tmp_path.rglob("*"))
     assert cli.main(["plot", *arguments]) == 2
     err = capsys.readouterr().err

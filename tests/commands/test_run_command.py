@@ -56,6 +56,7 @@ def test_evaluate_on_the_twin_reports_true_poses(tmp_path, twin_calibration):
         (["hardware=twin", "goal=[1,2]"], "goal"),
         (["hardware=twin", "log=/nowhere/log"], "folder"),
         (["hardware=lynxmotion", "camera.path=/dev/null/cam", "start=[0,0,0]"], "start"),
+        (["hardware=lynxmotion", "camera.path=/dev/null/cam", "printed=true"], "printed"),
         (["hardware=twin", "watch.steady_frames=1"], "steady_frames"),
         (["hardware=nonsense"], "nonsense"),
         (["hardware=lynxmotion", "camera.path=/dev/no-camera"], "/dev/no-camera is not there"),

@@ -24,6 +24,11 @@ def test_an_episode_is_played_and_filmed(tmp_path, capsys):
     assert "success after" in out
     assert "1 of 1 episodes reached the goal" in out
     assert len(list(imageio.get_reader(video))) > 5
+    # Words and colours are for the eye alone: what happens is the same without them.
+    assert simulate(*arguments, "progress=false", "captions=false") == 0
+    assert [line.split(";")[:2] for line in capsys.readouterr().out.splitlines()[:3]] == [
+        line.split(";")[:2] for line in out.splitlines()[:3]
+    ]
 
 
 @pytest.mark.parametrize(
@@ -32,6 +37,7 @@ def test_an_episode_is_played_and_filmed(tmp_path, capsys):
         ("video=a.avi", ".mp4 or .gif"),
         ("video=/no/such/folder/a.mp4", "/no/such/folder"),
         ("size=[3,4]", "size"),
+        ("size=[640,24]", "room for the words below the picture; or captions=false"),
         ("grasp=glue", "glue"),
         ("view=side", "side"),
         ("start=[0,0]", "start"),

@@ -65,6 +65,7 @@ def wired(request) -> HardwareConfig:
 @pytest.fixture
 def rig(model, tmp_path):
     """``rig(config, faults, confirm=..., **driver)``: clock, latch, emulated cell, its first device, driver; the boards run since 1 s."""
+    made = []
 
     def make(config=None, faults="", confirm=lambda text: True, dry_run=False):
         config = config or _one_board()
@@ -76,9 +77,12 @@ def rig(model, tmp_path):
         device.advance(1.0)
         device.add_faults(parse_faults(faults))
         driver = ArmDriver(config, model, clock=clock, latch=latch, confirm=confirm, dry_run=dry_run)
-        return SimpleNamespace(clock=clock, latch=latch, cell=cell, device=device, driver=driver, config=config)
+        made.append(SimpleNamespace(clock=clock, latch=latch, cell=cell, device=device, driver=driver, config=config))
+        return made[-1]
 
-    return make
+    yield make
+    for rig in made:
+        rig.driver.close()
 
 
 @pytest.fixture

@@ -13,10 +13,12 @@ from hypothesis import strategies as st
 from marl_handover.errors import BadOverride, UnknownChoice
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.emulator.board import Board
+from marl_handover.hardware.emulator.cell import EmulatedCell
 from marl_handover.hardware.emulator.device import Device
 from marl_handover.hardware.emulator.faults import Fault, make_fault, parse_faults
 from marl_handover.hardware.emulator.protocol_ssc32emu import mount, unmount
 from marl_handover.hardware.emulator.servo import Servo, ServoTruth
+from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.hardware.ssc32 import Ssc32  # noqa: F401  # registers the URL scheme
 
 TRUTH = ServoTruth(1500.0, 600.0, -1.2, 1.2, speed=4.5, dead_band_us=8.0, lag_s=0.03)
@@ -244,3 +246,24 @@ def test_no_byte_overtakes_another(pieces):
     times = [t_s for t_s, _ in device.lines]
     assert times == sorted(times)
     assert np.all(np.diff(times) >= 0)
+
+
+def test_no_two_servos_are_alike_the_grippers_neither(model):
+    def drawn(**changes):
+        config = HardwareConfig()
+        for name, value in changes.items():
+            setattr(config.emulator, name, value)
+        return EmulatedCell(config, model.arm, np.zeros(5)).truths
+
+    emulator, gripper = HardwareConfig().emulator, HardwareConfig().arms["left"].gripper
+    truths = [truth for seed in range(20) for arm in drawn(seed=seed).values() for truth in arm]
+    bands = np.array([truth.dead_band_us for truth in truths])
+    assert np.abs(bands - emulator.dead_band_us).max() <= 2 * emulator.dead_band_sd_us
+    assert 0.6 * emulator.dead_band_sd_us < bands.std() < emulator.dead_band_sd_us
+    closed = np.array([truth.zero_us for truth in truths[5::6]]) - gripper.closed_us
+    assert 5.0 < closed.std() < 25.0
+    assert np.ptp([truth.slope_us for truth in truths[5::6]]) > 0.02 * abs(truths[5].slope_us)
+    assert drawn(seed=3) == drawn(seed=3)
+    exact = drawn(dead_band_sd_us=0.0, offset_sd_us=0.0, scale_sd=0.0)
+    assert exact["left"] == exact["right"]
+    assert {truth.dead_band_us for truth in exact["left"]} == {emulator.dead_band_us}

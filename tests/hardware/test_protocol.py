@@ -28,7 +28,7 @@ pulses = st.integers(500, 2500)
         (protocol.encode_line([Offset(2, -100), Offset(3, 17)]), b"#2PO-100#3PO17\r"),
         (protocol.encode_line([Level(3, True), Level(4, False)]), b"#3H#4L\r"),
         (protocol.byte_output(3, 123), b"#3:123\r"),
-        (protocol.stop([0, 31]), b"STOP0\rSTOP31\r"),
+        (protocol.stop([0, 31]), b"\x1bSTOP0\rSTOP31\r"),
         (protocol.query_pulses([5]), b"QP5\r"),
         (protocol.query_pulses([0, 16]), b"QP0QP16\r"),
         (protocol.read_digital(["A", "BL"]), b"A BL\r"),

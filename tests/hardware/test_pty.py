@@ -75,6 +75,7 @@ def test_the_driver_on_a_real_port(served, model, tmp_path):
         device.add_faults([make_fault("unplug", emulator.now_s(), 0.5)])
         with pytest.raises(PortLost):
             go_on(driver, q)
+        assert driver.state is State.LOST
         driver.reconnect()
         assert link.is_symlink()
         driver.arm()
@@ -83,6 +84,25 @@ def test_the_driver_on_a_real_port(served, model, tmp_path):
             driver.move([JointCommand(0, q, 12.0)], 0.06)
         assert driver.state is State.STOPPED
     assert driver.state is State.DISCONNECTED
+
+
+def test_a_cable_that_came_out_in_a_pause(served, model, tmp_path):
+    """The first thing to fail then is flushing what came in, and not a read or a write."""
+    link = tmp_path / "port"
+    config = HardwareConfig(boards={"main": BoardConfig(str(link))})
+    config.timeouts.reply_s = 1.0
+    config.stream.settle_s = 0.05
+    device = EmulatedCell(config, model.arm, np.radians([0.0, 140.0, -115.0, 70.0, 0.0])).devices["main"]
+    emulator = served(device, link)
+    with ArmDriver(config, model, latch=StopLatch(tmp_path / "stop"), confirm=lambda text: True) as driver:
+        driver.arm()
+        device.add_faults([make_fault("unplug", emulator.now_s())])
+        while link.is_symlink():
+            time.sleep(0.01)
+        with pytest.raises(PortLost):
+            driver.move([JointCommand(0, driver.parked_rad, 12.0)], 0.06)
+        assert driver.state is State.LOST
+        assert not driver.halt()
 
 
 def test_a_pty_is_paced_and_its_rate_counts(served, tmp_path):

@@ -11,7 +11,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from marl_handover.cell.urdf import ARM_JOINTS
-from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, NotFinite, UnknownChoice
+from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, UnknownChoice
 from marl_handover.hardware.calibration import (
     CalibrationProblem,
     ServoMap,
@@ -20,7 +20,6 @@ from marl_handover.hardware.calibration import (
     make_calibration,
     nominal_calibration,
 )
-from marl_handover.hardware.procedure import CalibrationProcedure
 from marl_handover.hardware.settings import HardwareConfig
 
 
@@ -149,35 +148,3 @@ def test_the_paper_cells_joint_range_has_pulses(model):
     ends = calibration.to_us(np.stack([model.arm.lower_rad, model.arm.upper_rad]))
     assert ends.min() >= 500
     assert ends.max() <= 2500
-
-
-def test_the_procedure_finds_the_servos_that_are_there(armed):
-    """Measured to half a degree at random, the maps come out near the true ones, and far nearer than the nominal ones."""
-    rig = armed()
-    random = np.random.default_rng(1)
-    procedure = CalibrationProcedure(rig.driver, arm=1)
-    for stop in procedure.stops:
-        procedure.go(stop)
-        true = rig.cell.joints_rad(rig.clock.now_s())[1, stop.joint]
-        procedure.record(stop, true + math.radians(random.normal(0.0, 0.25)))
-    found = procedure.result()
-    assert found.arm == "right"
-    for joint, (servo, truth) in enumerate(zip(found.maps, rig.cell.truths["right"], strict=False)):
-        angles = np.linspace(*procedure.ranges_rad[joint], 5)
-        off_deg = np.degrees(np.abs(servo.to_rad(truth.zero_us + truth.slope_us * angles) - angles))
-        assert off_deg.max() < 0.6, servo.name
-
-
-def test_the_procedure_keeps_clear_and_takes_nothing_unvisited(armed):
-    rig = armed()
-    procedure = CalibrationProcedure(rig.driver, arm=0, points=2)
-    for joint, (low, high) in enumerate(procedure.ranges_rad):
-        assert low > rig.driver.model.arm.lower_rad[joint]
-        assert high < rig.driver.model.arm.upper_rad[joint]
-    with pytest.raises(CalibrationProblem, match="never went|went there"):
-        procedure.record(procedure.stops[0], 0.1)
-    procedure.go(procedure.stops[0])
-    with pytest.raises(NotFinite):
-        procedure.record(procedure.stops[0], math.nan)
-    with pytest.raises(CalibrationProblem, match="two points"):
-        procedure.result()

@@ -156,6 +156,26 @@ def test_pulses_that_come_out_different_every_time_are_not_believed():
         board.pulses(range(8))
 
 
+@pytest.mark.parametrize(
+    ("said", "believed"),
+    [
+        ([b"\x96", b"\xc8", b"\xc8"], 2000),
+        ([b"\x96", b"\x00", b"\x00"], None),
+        ([b"\x00", b"\x96", b"\x97"], 1510),
+        ([b"\x96", b"\xc8", b"\x96", b"\xc8"], BadReply),
+        ([b"\x00", b"\x96", b"\x00", b"\x96"], BadReply),
+    ],
+)
+def test_a_pulse_is_believed_when_it_was_said_twice(said, believed):
+    board, _, _ = made(board=Liar(iter([b"SSC32-V2.50USB\r", *said])))
+    board.connect()
+    if believed is BadReply:
+        with pytest.raises(BadReply, match="twice"):
+            board.pulses([0])
+    else:
+        assert board.pulses([0]) == {0: believed}
+
+
 def test_a_late_reply_is_not_taken_for_the_next_one():
     board, _, clock = made("late@1:0.05=0.15")
     board.connect()
@@ -201,10 +221,11 @@ def test_a_dry_run_writes_questions_and_stops_only():
     assert (sent.data, sent.written) == (b"#0P1500\r", False)
     board.move({0: 1600}, 100)
     board.stop([0])
+    assert not board.limp([0]).written
     clock.sleep_s(0.1)
     assert device.outputs_us(clock.now_s())[0] == 0.0
-    assert [line for _, line in device.lines] == [b"\x1bVER\r", b"STOP0\r"]
-    assert [entry.data for entry in board.log if entry.direction == "x"] == [b"#0P1500\r", b"#0P1600T100\r"]
+    assert [line for _, line in device.lines] == [b"\x1bVER\r", b"\x1bSTOP0\r"]
+    assert [entry.data for entry in board.log if entry.direction == "x"] == [b"#0P1500\r", b"#0P1600T100\r", b"#0L\r"]
 
 
 def test_the_log_has_every_byte_and_an_end():
@@ -255,7 +276,6 @@ def test_nor_when_some_of_it_is_right(replies):
     fuzz([b"SSC32-V2.50USB\r", *replies])
 
 
-@pytest.mark.slow
 def test_a_million_random_bytes():
     import random
 

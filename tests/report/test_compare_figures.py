@@ -6,8 +6,6 @@ import itertools
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.text import Text
 
 from marl_handover.report.compare import curves_figure, make_figures, profiles_figure
 from marl_handover.report.compare_bars import KINDS, bars_figure, endings_figure, kind_of
@@ -89,49 +87,20 @@ FEW = suite([row("a", "A", 0), row("b", "grid", 1, algorithm="dqn"), row("c", "e
 ALONE = suite([row("a", "one", 0, runs=1)])
 
 
-def assert_tidy(figure):
-    """All texts lie on the page and apart."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    renderer = canvas.get_renderer()
-    # A tick beyond the end of its axis is there, but not drawn.
-    unseen = set()
-    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
-        low, high = sorted(axis.get_view_interval())
-        for tick in axis.get_major_ticks():
-            if not low - 1e-9 <= tick.get_loc() <= high + 1e-9:
-                unseen |= {tick.label1, tick.label2}
-    boxes = [
-        (text.get_text(), text.get_window_extent(renderer))
-        for text in figure.findobj(Text)
-        if text not in unseen and text.get_visible() and text.get_text().strip()
-    ]
-    for text, box in boxes:
-        assert box.x0 >= -1, text
-        assert box.y0 >= -1, text
-        assert box.x1 <= figure.bbox.x1 + 1, text
-        assert box.y1 <= figure.bbox.y1 + 1, text
-    for (first, box), (second, other) in itertools.combinations(boxes, 2):
-        # Neighbours may touch, by a pixel of the line height.
-        across = min(box.x1, other.x1) - max(box.x0, other.x0)
-        along = min(box.y1, other.y1) - max(box.y0, other.y0)
-        assert across <= 1 or along <= 2, (first, second)
-
-
 @pytest.mark.parametrize("results", [MANY, FEW, ALONE], ids=["many", "few", "alone"])
 @pytest.mark.parametrize("x", ["step", "share"])
-def test_curves_are_tidy(results, x):
+def test_curves_are_tidy(results, x, assert_tidy):
     assert_tidy(curves_figure(results, spec("curves", x=x)))
 
 
 @pytest.mark.parametrize("results", [MANY, FEW, ALONE], ids=["many", "few", "alone"])
 @pytest.mark.parametrize("measure", ["success_rate", "mean_steps", "steps_ratio"])
-def test_bars_are_tidy(results, measure):
+def test_bars_are_tidy(results, measure, assert_tidy):
     assert_tidy(bars_figure(results, spec("bars", measure=measure)))
 
 
 @pytest.mark.parametrize("results", [MANY, FEW, ALONE], ids=["many", "few", "alone"])
-def test_endings_and_profiles_are_tidy(results):
+def test_endings_and_profiles_are_tidy(results, assert_tidy):
     assert_tidy(endings_figure(results, spec("end_states", evaluations=["kinematic"])))
     assert_tidy(endings_figure(results, spec("end_states")))
     assert_tidy(profiles_figure(results, spec("profiles")))

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from marl_handover.cell import build_cell, cell_config
+from marl_handover.errors import CorruptFile, InvalidSetting
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.report.files import save_figure
-from marl_handover.report.motion import SHOWN_MM, motion_figure
-from marl_handover.runtime.motions import plan_motions
+from marl_handover.report.motion import SHOWN_MM, motion_figure, read_motions, require_fit
+from marl_handover.runtime.motions import motion_row, plan_motions
 
 
 @pytest.fixture(scope="module")
@@ -56,3 +60,48 @@ def test_it_is_a_picture_in_every_format(panels, tmp_path):
     for suffix, start in ((".png", b"\x89PNG"), (".pdf", b"%PDF"), (".svg", b"<?xml")):
         save_figure(panels[1], tmp_path / f"motion{suffix}")
         assert (tmp_path / f"motion{suffix}").read_bytes().startswith(start)
+
+
+FILE = Path("motion.json")
+
+
+def content(motions):
+    """The file of some motions, read back."""
+    return json.loads(json.dumps({"transfers": [motion_row(motion) for motion in motions]}))
+
+
+def test_a_file_of_motions_gives_the_same_figure(planned, panels, assert_tidy):
+    planner, motions = planned
+    again = read_motions(content(motions), FILE)
+    require_fit(again, planner.model)
+    figure = motion_figure(again, planner.model, planner.motion)
+    assert_tidy(figure)
+    for drawn, first in zip(figure.axes, panels[1].axes, strict=True):
+        for line, same in zip(drawn.lines, first.lines, strict=True):
+            np.testing.assert_allclose(np.stack(line.get_data()), np.stack(same.get_data()), atol=1e-9)
+
+
+def test_motions_of_another_cell_are_refused(planned):
+    with pytest.raises(InvalidSetting, match="the cell of the motions"):
+        require_fit(read_motions(content(planned[1]), FILE), build_cell(cell_config("al5a")))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda row: row.pop("phases"), "it lacks 'phases'"),
+        (lambda row: row.update(arm="X"), "not in"),
+        (lambda row: row.update(to=[1, None]), "finite"),
+        (lambda row: row["phases"][0].update(name="dance"), "'dance' is no phase"),
+        (lambda row: row["phases"][2]["joints_rad"].pop(), "finite numbers"),
+        (lambda row: row.update(phases=row["phases"][:2]), "no phase in which the block is carried"),
+    ],
+)
+def test_broken_files_are_named(planned, change, said):
+    broken = content(planned[1])
+    change(broken["transfers"][0])
+    with pytest.raises(CorruptFile, match=said):
+        read_motions(broken, FILE)
+    for nothing in ({}, {"transfers": []}, {"transfers": 3}):
+        with pytest.raises(CorruptFile, match=r"motion\.json"):
+            read_motions(nothing, FILE)

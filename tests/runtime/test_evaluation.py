@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from marl_handover.config import TaskConfig
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.runtime.episode import Done, Episode, Order, Transfer
-from marl_handover.runtime.evaluation import loop_report
+from marl_handover.runtime.evaluation import loop_report, true_outcome, truly_solved
 from marl_handover.runtime.trace import trace_text
 from marl_handover.task.rules import Outcome, Rules
 
@@ -23,8 +24,8 @@ def rules(model):
     return Rules(model.cell, TaskConfig(), physical=True)
 
 
-def transfer(pose, predicted=GOAL, *, attempt=0, arm=0, final=True, refusal=None, outcome=Outcome.NONE, planning_ms=10.0):
-    done = Done(np.array(pose, float), refusal, "", planning_ms, 4.0, 200.0)
+def transfer(pose, predicted=GOAL, *, attempt=0, arm=0, final=True, refusal=None, outcome=Outcome.NONE, planning_ms=10.0, truth=None):
+    done = Done(np.array(pose, float), refusal, "", planning_ms, 4.0, 200.0, None if truth is None else np.array(truth, float))
     order = Order(arm, final, np.zeros(2), predicted[:2], np.array(predicted, float), True)
     over = outcome != Outcome.NONE
     return Transfer(attempt, GOAL, order, np.zeros(3), -1, done, -1.0, over, False, outcome)
@@ -57,6 +58,50 @@ def test_errors_are_of_the_first_final_placements(rules):
     assert report["refusals"] == {"declined": 1, "missed_grasp": 1}
     assert report["transfers"] == 7
     assert report["episode_s"]["p50"] == 0.5
+
+
+OFF = [
+    ((0.0, 0.0, 0.0), Outcome.SUCCESS),
+    ((6.0, 0.0, 0.0), Outcome.WRONG_POSITION),
+    ((0.0, -6.0, 0.0), Outcome.WRONG_POSITION),
+    ((0.0, 0.0, math.radians(6.0)), Outcome.WRONG_ORIENTATION),
+    ((0.0, 0.0, math.radians(-6.0)), Outcome.WRONG_ORIENTATION),
+    ((4.0, 0.0, math.radians(4.0)), Outcome.SUCCESS),
+]
+"""How far from the goal an object is, and what the rules, 5 mm and 5 degrees, say of it."""
+
+
+@pytest.mark.parametrize("architecture", ["A", "B"])
+@pytest.mark.parametrize(("seen_off", "seen_as"), OFF)
+@pytest.mark.parametrize(("true_off", "truly"), OFF)
+def test_the_referee_judges_by_where_the_object_truly_is(model, architecture, seen_off, seen_as, true_off, truly):
+    """Whatever the camera said, better or worse."""
+    rules = Rules(model.cell, TaskConfig(architecture=architecture), physical=True)
+    last = transfer(GOAL + seen_off, outcome=seen_as, truth=GOAL + true_off)
+    played = episode(last, ended="success" if seen_as is Outcome.SUCCESS else "transfers")
+    assert true_outcome(played, rules) is truly
+    assert truly_solved(played, rules) is (seen_as is Outcome.SUCCESS and truly is Outcome.SUCCESS)
+    assert loop_report([played], rules)["success_in_the_end"] == float(truly_solved(played, rules))
+    assert loop_report([played], rules)["position_error_mm"]["p50"] == pytest.approx(math.hypot(*true_off[:2]))
+
+
+def test_without_a_truth_the_loop_is_believed_and_no_truth_excuses_what_was_not_done(rules):
+    seen = episode(transfer(GOAL + (6.0, 0.0, 0.0), outcome=Outcome.SUCCESS))
+    assert true_outcome(seen, rules) is Outcome.SUCCESS
+    assert truly_solved(seen, rules)
+    for refusal, outcome in ((Refusal.DECLINED, Outcome.WRONG_POSITION), (Refusal.UNSEEN, Outcome.WRONG_POSITION)):
+        refused = episode(transfer(GOAL, refusal=refusal, outcome=outcome, truth=GOAL), ended="stuck")
+        assert true_outcome(refused, rules) is outcome
+        assert not truly_solved(refused, rules)
+
+
+def test_the_first_verdict_and_the_end_are_judged_each_at_its_own_transfer(rules):
+    first = transfer(GOAL, outcome=Outcome.SUCCESS, truth=GOAL + (6.0, 0.0, 0.0))
+    later = transfer(GOAL, attempt=1, outcome=Outcome.SUCCESS, truth=GOAL)
+    assert (true_outcome(episode(first, later), rules), truly_solved(episode(first, later), rules)) == (Outcome.WRONG_POSITION, True)
+    first, later = (one.done._replace(truth=other.done.truth) for one, other in ((first, later), (later, first)))
+    swapped = episode(replace(transfer(GOAL, outcome=Outcome.SUCCESS), done=first), replace(transfer(GOAL, attempt=1), done=later))
+    assert (true_outcome(swapped, rules), truly_solved(swapped, rules)) == (Outcome.SUCCESS, False)
 
 
 def test_the_bias_is_along_and_across_the_arms_ray(rules):

@@ -23,7 +23,7 @@ from marl_handover.runtime.evaluation import truly_solved
 from marl_handover.runtime.events import FAULTS, Event
 from marl_handover.runtime.loop import make_loop
 from marl_handover.runtime.mishaps import Mishaps
-from marl_handover.runtime.session import GivenGoal, PrintedGoal, Session
+from marl_handover.runtime.session import GivenGoal, NoGoal, Session
 from marl_handover.runtime.settings import WatchConfig, twin_lab
 
 START, PLACE_MM = np.array([-60.0, 20.0, 0.7]), np.array([50.0, 25.0])
@@ -165,9 +165,25 @@ def test_a_goal_that_changes_in_mid_motion_is_reached_after_the_transfer(start):
 def test_the_printed_goal_is_gone_for(start):
     lab = start()
     lab.twin.goal = lab.goal_pose
-    episode = lab.session.play(START, PrintedGoal(lab.session.backend))
+    episode = lab.session.play(START, lab.session.printed)
     assert math.dist(episode.goal[:2], lab.goal_pose[:2]) < 1.0
     assert solved(lab, episode)
+
+
+def test_a_printed_goal_that_the_block_covers_is_the_one_before(start):
+    """A second episode on a real cell begins with the block where the first one put it: on the marker."""
+    lab = start()
+    lab.twin.goal = lab.goal_pose
+    with pytest.raises(NoGoal):
+        lab.session.play(lab.goal_pose, lab.session.printed)
+    assert solved(lab, lab.session.play(START, lab.session.printed))
+    for _ in range(2):
+        episode = lab.session.play(lab.twin.true_pose(), lab.session.printed)
+        assert math.dist(episode.goal[:2], lab.goal_pose[:2]) < 1.0
+        assert solved(lab, episode)
+    lab.session.printed.forget()
+    with pytest.raises(NoGoal):
+        lab.session.play(lab.goal_pose, lab.session.printed)
 
 
 def test_a_block_outside_all_reach_is_waited_for(start):
@@ -194,6 +210,60 @@ def test_a_hidden_marker_and_a_frozen_camera_are_waited_for(start):
     episode = lab.session.play(START, lab.goal)
     assert solved(lab, episode)
     assert lab.counts[Event.CAMERA_FROZEN] == 1
+
+
+def test_a_block_out_of_sight_after_a_motion_is_not_taken_for_a_fallen_one(start):
+    """A hand over it for longer than there is patience: it is waited for once more, and the episode goes on."""
+    lab = start()
+    when(lab, lambda: carried_high(lab), lambda: lab.twin.hide(8.0))
+    episode = lab.session.play(START, lab.goal)
+    assert episode.transfers[0].done.refusal == "unseen"
+    assert solved(lab, episode)
+    assert lab.counts[Event.MARKER_HIDDEN] >= 1
+
+
+def test_a_block_that_stays_out_of_sight_ends_the_episode_not_the_session(start):
+    lab = start()
+    when(lab, lambda: carried_high(lab), lambda: lab.twin.hide(30.0))
+    begun_s = lab.clock.now_s()
+    episode = lab.session.play(START, lab.goal)
+    assert (episode.ended, [str(transfer.done.refusal) for transfer in episode.transfers]) == ("stuck", ["unseen"])
+    assert lab.clock.now_s() - begun_s < 25.0
+    lab.clock.sleep_s(30.0)
+    assert solved(lab, lab.session.play(START, lab.goal))
+
+
+def test_after_a_question_that_found_no_good_answer_the_motion_goes_on_where_it_was(start):
+    """Answers get lost by lot until one question has gone without any, three times asked, of a board that is there otherwise."""
+    lab = start()
+
+    def lose():
+        if lab.counts[Event.BAD_REPLY] == 0:
+            lab.twin.add_faults([make_fault("drop", lab.clock.now_s(), 0.02, 0.45)])
+            lab.clock.at(lab.clock.now_s() + 0.02, lose)
+
+    when(lab, lambda: carried_high(lab), lose)
+    episode = lab.session.play(START, lab.goal)
+    assert lab.counts[Event.BAD_REPLY] == 1
+    assert len(episode.transfers) == 1
+    assert solved(lab, episode)
+
+
+def test_a_host_that_was_late_goes_on_where_it_was(start):
+    lab = start()
+    stalled = []
+
+    def stall(row):
+        if row["event"] == "state" and carried_high(lab) and not stalled:
+            stalled.append(lab.clock.now_s())
+            lab.clock.sleep_s(1.0)
+
+    lab.session.log.show(stall)
+    episode = lab.session.play(START, lab.goal)
+    assert stalled
+    assert lab.counts[Event.HOST_LATE] == 1
+    assert len(episode.transfers) == 1
+    assert solved(lab, episode)
 
 
 def test_after_a_lost_cable_the_motion_goes_on_where_it_was(start):
@@ -224,14 +294,14 @@ def test_after_a_brown_out_somebody_parks_the_arms_and_the_loop_goes_on(start):
     assert episode.transfers[0].done.refusal in ("dropped", "missed_grasp")
 
 
-def test_an_arm_that_does_nothing_time_and_again_is_stalled(start):
+def test_an_arm_that_does_nothing_time_and_again_ends_the_episode(start):
     lab = start()
     channel = lab.twin.hardware.arms[ARMS[0]].gripper.channel
     lab.twin.add_faults([make_fault("jam", lab.clock.now_s(), None, channel)])
     episode = lab.session.play(START, lab.goal)
     assert episode.ended == "stuck"
-    assert lab.counts[Event.ARM_STALLED] >= 1
-    assert len(episode.transfers) < 8
+    assert lab.counts[Event.ARM_STALLED] == 1
+    assert [str(transfer.done.refusal) for transfer in episode.transfers] == ["missed_grasp", "missed_grasp", "stalled"]
 
 
 def test_what_the_gate_refuses_is_not_sent_and_the_arm_goes_home(start):
@@ -254,6 +324,24 @@ def test_the_latched_stop_ends_the_session_where_it_is(start, tmp_path):
     lab.clock.sleep_s(1.0)
     np.testing.assert_allclose(lab.twin.true_joints_rad(), before, atol=math.radians(0.2))
     assert StopLatch(tmp_path / "stop").obeyed_by() is not None
+
+
+@pytest.mark.parametrize("why", ["hidden", "outside"])
+def test_the_latched_stop_is_obeyed_while_nothing_moves(start, tmp_path, why):
+    """Looking for a block, and waiting for one to be put back, last far longer than a stop may take."""
+    lab = start()
+    pose = START if why == "hidden" else np.array([230.0, 0.0, 0.0])
+    lab.twin.hide(1e6 if why == "hidden" else 0.0)
+    latched_s = lab.clock.now_s() + 2.0
+    lab.clock.at(latched_s, lambda: StopLatch(tmp_path / "stop").latch("test"))
+    with pytest.raises(Stopped, match="test"):
+        lab.session.play(pose, lab.goal)
+    assert lab.clock.now_s() - latched_s < 0.1
+    assert lines(lab.log)[-1]["event"] == "stopped"
+    assert StopLatch(tmp_path / "stop").obeyed_by() is not None
+    lab.clock.sleep_s(0.1)
+    for device in lab.twin.electronics.devices.values():
+        assert [t_s for t_s, line in device.lines if b"STOP" in line and t_s >= latched_s]
 
 
 def test_a_dry_run_does_everything_and_moves_nothing(start):

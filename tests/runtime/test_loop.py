@@ -50,11 +50,39 @@ class Pushed(NoisyBackend):
         return done._replace(pose=self._pose.copy())
 
 
-class Tipping(NoisyBackend):
-    """The object falls over wherever it is put."""
+class Hopeless(NoisyBackend):
+    """Every transfer ends in the same way."""
+
+    def __init__(self, model, refusal):
+        super().__init__(model, MOTION, noise=EXACT, missed_grasps=0.0)
+        self.refusal = refusal
 
     def execute(self, arm, paths):
-        return super().execute(arm, paths)._replace(refusal=Refusal.TIPPED)
+        return super().execute(arm, paths)._replace(refusal=self.refusal)
+
+
+class Covered(NoisyBackend):
+    """An object that nobody sees after a transfer: for a number of looks, then it lies where it was put."""
+
+    same = (0.01, 1e-4)
+
+    def __init__(self, model, looks):
+        super().__init__(model, MOTION, noise=EXACT, missed_grasps=0.0)
+        self.looks, self.covered = looks, False
+
+    def execute(self, arm, paths):
+        before = self._pose.copy()
+        done = super().execute(arm, paths)
+        if not self.looks:
+            return done
+        self.covered = True
+        return done._replace(pose=before, refusal=Refusal.UNSEEN)
+
+    def watch(self):
+        if self.covered:
+            self.looks -= 1
+        self.covered = self.covered and self.looks > 0
+        return None if self.covered else self._pose.copy()
 
 
 def quiet(model, missed=0.0):
@@ -212,10 +240,42 @@ def test_an_arm_that_declines_is_a_wrong_position(planner, architecture):
     np.testing.assert_array_equal(first.done.pose, START)
 
 
-def test_an_object_that_tipped_over_is_left_to_people(planner):
-    backend = Tipping(planner.model, MOTION, noise=EXACT, missed_grasps=0.0)
-    episode = scripted(planner, backend, [[FINAL, LEFT, 0.0, 0.0]]).play(fitting(planner.model), GOAL)
+@pytest.mark.parametrize("refusal", [Refusal.TIPPED, Refusal.STALLED])
+@pytest.mark.parametrize("architecture", ["A", "B"])
+def test_what_an_arm_cannot_mend_is_left_to_people(planner, refusal, architecture):
+    """At once, also by a policy that would order something else each time."""
+    orders = [[HAND_OVER, LEFT, place, 0.0] for place in (-0.4, -0.2, 0.0, 0.2)]
+    episode = scripted(planner, Hopeless(planner.model, refusal), orders, architecture=architecture).play(START, GOAL)
     assert (episode.outcome, episode.ended, len(episode.transfers)) == (Outcome.WRONG_POSITION, "stuck", 1)
+
+
+def test_an_object_out_of_sight_is_no_success_though_it_lay_at_the_goal(planner):
+    """Nobody knows where it is now."""
+    loop = scripted(planner, Hopeless(planner.model, Refusal.UNSEEN), [[FINAL, LEFT, 0.0, 0.0]])
+    episode = loop.play(GOAL, GOAL)
+    assert episode.outcome == Outcome.WRONG_POSITION
+    assert not episode.solved
+
+
+@pytest.mark.parametrize(("looks", "ended"), [(1, "success"), (99, "stuck")])
+def test_an_object_out_of_sight_is_waited_for_once_more(planner, looks, ended):
+    backend = Covered(planner.model, looks)
+    episode = scripted(planner, backend, [[FINAL, LEFT, 0.0, 0.0]]).play(fitting(planner.model), GOAL)
+    assert episode.transfers[0].done.refusal == Refusal.UNSEEN
+    assert episode.ended == ended
+
+
+def test_a_goal_that_changes_once_the_transfers_are_spent_is_not_reached(planner):
+    """Nor is the old one what the episode says it ended at."""
+    start, told = fitting(planner.model), [GOAL]
+    loop = scripted(planner, quiet(planner.model), [[FINAL, LEFT, 0.0, 0.0]], LoopConfig(transfers=1), max_steps=1)
+    assert loop.play(start, GOAL, goals=lambda: told[-1]).ended == "success"
+    for shift, ended in ((60.0, "transfers"), (1.0, "success")):
+        new = GOAL + (shift, 0.0, 0.0)
+        episode = loop.play(start, GOAL, observer=lambda transfer, new=new: told.append(new), goals=lambda: told[-1])
+        np.testing.assert_array_equal(episode.goal, new)
+        assert episode.ended == ended
+        told[:] = [GOAL]
 
 
 def test_transfers_run_out(planner):

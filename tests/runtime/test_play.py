@@ -73,22 +73,32 @@ def test_aims_keep_to_the_limits():
 def test_half_a_band_is_an_angle_of_each_servo(planner):
     arm = planner.model.arm
     maps = [nominal_calibration(HardwareConfig(), name, arm) for name in ARMS]
-    found = np.degrees(half_bands_rad({"left": 4.0, "right": 2.0}, maps))
-    np.testing.assert_allclose(found, [[4 / 9.5, 4 / 9.2, 4 / 9.2, 4 / 9.5, 0.4], [2 / 9.5, 2 / 9.2, 2 / 9.2, 2 / 9.5, 0.2]])
+    found = np.degrees(half_bands_rad({"left": [4.0, 3.0, 2.0, 1.0, 5.0], "right": np.full(5, 2.0)}, maps))
+    np.testing.assert_allclose(found, [[4 / 9.5, 3 / 9.2, 2 / 9.2, 1 / 9.5, 0.5], [2 / 9.5, 2 / 9.2, 2 / 9.2, 2 / 9.5, 0.2]])
 
 
 def test_file_round_trip_and_what_may_be_wrong_with_it(tmp_path):
     with pytest.raises(MissingFile, match="calibrate"):
         load_play(tmp_path)
-    save_play(tmp_path / "new", {"left": 3.9, "right": 4.2})
-    assert load_play(tmp_path / "new") == {"left": 3.9, "right": 4.2}
+    half, sure = {"left": [3.9, 1.0, 2.0, 6.5, 4.0], "right": np.arange(5.0)}, {"left": np.ones(5), "right": np.full(5, 0.3)}
+    save_play(tmp_path / "new", half, sure)
+    found = load_play(tmp_path / "new")
+    for arm, bands in half.items():
+        np.testing.assert_allclose(found[arm], bands)
+    assert json.loads((tmp_path / "new" / FILE).read_text())["half_band_sd_us"]["right"]["elbow"] == 0.3
     path = tmp_path / FILE
     path.write_text("{")
     with pytest.raises(CorruptFile):
         load_play(tmp_path)
-    path.write_text(json.dumps({"version": 9, "half_band_us": {"left": 1, "right": 1}}))
-    with pytest.raises(CorruptFile, match="version"):
+    path.write_text(json.dumps({"version": 1, "half_band_us": {"left": 3.9, "right": 4.2}}))
+    with pytest.raises(CorruptFile, match="version 1.*each joint.*calibrate what=servos"):
         load_play(tmp_path)
-    path.write_text(json.dumps({"version": 1, "half_band_us": {"left": 1, "right": 99}}))
-    with pytest.raises(InvalidSetting, match="right"):
+    content = json.loads((tmp_path / "new" / FILE).read_text())
+    content["half_band_us"]["right"]["elbow"] = 99
+    path.write_text(json.dumps(content))
+    with pytest.raises(InvalidSetting, match="right.elbow"):
+        load_play(tmp_path)
+    del content["half_band_us"]["right"]["elbow"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(CorruptFile, match="elbow"):
         load_play(tmp_path)

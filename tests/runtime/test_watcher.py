@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import threading
 
 import numpy as np
 import pytest
 
-from marl_handover.hardware.clock import VirtualClock
+from marl_handover.hardware.clock import RealClock, VirtualClock
 from marl_handover.perception.calibration import flat_pose, hung_camera
-from marl_handover.perception.camera import Frame, RenderedCamera
+from marl_handover.perception.camera import Frame, LiveCamera, RenderedCamera, StaleFrame
 from marl_handover.perception.detector import Detector
 from marl_handover.perception.scene import CellPainter
 from marl_handover.perception.settings import LookConfig, MountConfig
@@ -114,3 +115,79 @@ def test_a_glance_takes_one_picture(stage):
     stage.hidden_s = 100.0
     stage.clock.sleep_s(0.1)
     assert stage.watcher.glance() is None
+
+
+class Stuck:
+    """A camera that gives one picture at a time, and none unless it is told to."""
+
+    name = "stuck"
+
+    def __init__(self, image):
+        self.image, self.go = image, threading.Event()
+        self.go.set()
+
+    def grab(self):
+        if not self.go.wait(0.02):
+            return None
+        self.go.clear()
+        return self.image
+
+    def stop(self):
+        pass
+
+
+@pytest.fixture
+def live(model, painter):
+    """A watcher behind a live camera that has stopped giving pictures, and would be waited for longer than any test lasts."""
+    clock, device = RealClock(), Stuck(painter.picture(flat_pose(*POSE), None, None))
+    camera = LiveCamera(device, warm_up_s=0.0, max_age_s=1e6, timeout_s=600.0, clock=clock.now_s)
+    log = EventLog(clock.now_s)
+    tracker = Tracker(Detector(painter.renderer.calibration, model.cell.config.block))
+    watcher = Watcher(camera, tracker, clock, WatchConfig(picture_s=0.1, patience_s=1.0), log)
+    yield watcher, device
+    camera.close()
+
+
+def in_time(call):
+    """What a call gives; it must not take for ever."""
+    given = []
+    thread = threading.Thread(target=lambda: given.append(call()), daemon=True)
+    thread.start()
+    thread.join(30.0)
+    assert given, "it waits"
+    return given[0]
+
+
+def test_a_glance_does_not_wait_for_a_camera_that_gives_nothing(live):
+    watcher, device = live
+    assert in_time(watcher.glance) is None
+    device.go.set()
+    while watcher.camera.newest().number < 2:
+        device.go.wait(0.01)
+    assert math.dist(in_time(watcher.glance)[:2], POSE[:2]) < 0.5
+    assert in_time(watcher.glance) is None, "the same picture says nothing new"
+
+
+def test_a_look_at_a_camera_that_gives_nothing_ends_and_says_so(live):
+    watcher, _ = live
+    view = in_time(watcher.look)
+    assert view.block is None
+    assert not view.camera_works
+    assert watcher.log.counts == {Event.CAMERA_FROZEN: 1}
+
+
+def test_pictures_that_come_more_slowly_than_looks_are_waited_for(model, painter):
+    """Six pictures a second, thirty looks: those that find nothing new say nothing against the sightings between them."""
+    stage = Stage(model, painter)
+    read, next_s = stage.watcher.camera.read, [0.0]
+
+    def slowly(max_age_s=None, wait_s=None):
+        if stage.clock.now_s() < next_s[0]:
+            raise StaleFrame("slow camera", 0.0, 0.0)
+        next_s[0] = stage.clock.now_s() + 1 / 6
+        return read(max_age_s, wait_s)
+
+    stage.watcher.camera.read = slowly
+    view = stage.watcher.look()
+    assert math.dist(view.block[:2], POSE[:2]) < 0.5
+    assert not stage.log.counts

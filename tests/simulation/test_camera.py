@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
+from marl_handover.cell import build_cell, cell_config
+from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
+from marl_handover.runtime.motions import grip_mm
+from marl_handover.simulation.camera import TOP, view
 
 
 def red_centre(image):
@@ -31,3 +35,37 @@ def test_pictures_have_the_size_asked_for_and_repeat(cell):
     assert np.array_equal(first, second)
     with pytest.raises(InvalidSetting, match="width"):
         cell.camera_image(0, 90)
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 360), (640, 240), (320, 360), (500, 500)])
+def test_a_picture_of_another_shape_shows_all_and_more(cell, width, height):
+    """The whole of 1280 x 720 is in it, as large as it fits, in the middle."""
+    pose = (150.0, 200.0, 0.0)  # near a corner
+    cell.reset(pose)
+    scale = min(width / 1280, height / 720)
+    depth = 700 - cell.model.cell.config.block.height_mm
+    wanted = (width / 2 - scale * 917 * pose[1] / depth, height / 2 - scale * 917 * (pose[0] + 9) / depth)
+    np.testing.assert_allclose(red_centre(cell.camera_image(width, height)), wanted, atol=3)
+
+
+@pytest.mark.parametrize("name", ["paper", "al5a"])
+def test_the_overview_shows_all_that_arms_reach_and_the_parked_hands(name):
+    model = build_cell(cell_config(name))
+    cell, camera = model.cell, view("overview", model.cell)
+    assert view("top", cell) is TOP
+    angle, radius = (grid.ravel() for grid in np.meshgrid(np.linspace(*cell.yaw_rad, 60), [cell.r_min_mm, cell.r_max_mm]))
+    points = []
+    for base in cell.bases:
+        turned = base.facing_rad + angle
+        points.append(np.stack([base.x_mm + radius * np.cos(turned), base.y_mm + radius * np.sin(turned), 0 * angle], -1))
+    parked = np.radians(MotionConfig().parked_deg)
+    points += [grip_mm(model, arm, parked)[None] for arm in range(cell.num_arms)]
+    away = np.concatenate(points) - camera.eye_mm
+    forward = np.subtract(camera.target_mm, camera.eye_mm)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, camera.up)
+    right = right / np.linalg.norm(right)
+    depth, across, along = away @ forward, away @ right, away @ np.cross(right, forward)
+    assert np.abs(camera.focal_px * across / depth).max() < camera.width_px / 2
+    assert np.abs(camera.focal_px * along / depth).max() < camera.height_px / 2
+    assert across[60:120].mean() < 0  # the left arm's outer edge is on the left

@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 
 class EmulatedCell:
-    """Boards and servos as the settings wire them, each servo off its nominal scale and offset by amounts drawn from the seed.
+    """Boards and servos as the settings wire them, each servo with a scale, an offset and a dead band of its own, drawn from the seed.
 
     Args:
         config: the electronics; ``config.emulator`` says what the servos are like.
@@ -92,14 +92,16 @@ class EmulatedCell:
             low, high = self._arm.lower_rad[index] - beyond, self._arm.upper_rad[index] + beyond
             truths.append(self._truth(zero_us, slope, float(low), float(high), speeds[index]))
         gripper = config.arms[arm].gripper
-        slope = (gripper.open_us - gripper.closed_us) / gripper.open_mm
+        zero_us = gripper.closed_us + self._error(emulator.offset_sd_us)
+        slope = (gripper.open_us - gripper.closed_us) / gripper.open_mm * (1 + self._error(emulator.scale_sd))
         radius_mm = 10.0  # of the gripper servo's crank
-        truths.append(self._truth(float(gripper.closed_us), slope, 0.0, config.gate.finger_mm + 1.0, speeds[-1] * radius_mm))
+        truths.append(self._truth(zero_us, slope, 0.0, config.gate.finger_mm + 1.0, speeds[-1] * radius_mm))
         return truths
 
     def _truth(self, zero_us: float, slope_us: float, low: float, high: float, speed: float) -> ServoTruth:
         emulator = self.config.emulator
-        return ServoTruth(zero_us, slope_us, low, high, speed, emulator.dead_band_us, emulator.lag_s, emulator.settle_sd_us)
+        band_us = max(0.0, emulator.dead_band_us + self._error(emulator.dead_band_sd_us))
+        return ServoTruth(zero_us, slope_us, low, high, speed, band_us, emulator.lag_s, emulator.settle_sd_us)
 
     def _error(self, sd: float) -> float:
         return max(-2.0, min(2.0, self._random.gauss(0.0, 1.0))) * sd

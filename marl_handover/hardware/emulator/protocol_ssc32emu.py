@@ -1,13 +1,15 @@
 """The pyserial URL scheme ``ssc32emu://name``: a mounted :class:`Device` as a serial port inside the process.
 
 pyserial finds this module by its name, in a package of ``serial.protocol_handler_packages``. Reads and writes fail as those of a real port
-whose cable comes out: a read and a write with ``SerialException``, ``in_waiting`` with a bare ``OSError``, and ``is_open`` stays True.
+whose cable comes out: a read and a write with ``SerialException``, ``in_waiting`` with a bare ``OSError``, flushing with ``termios.error``,
+which is neither, and ``is_open`` stays True.
 """
 
 from __future__ import annotations
 
 import errno
 import os
+import termios
 from weakref import WeakKeyDictionary
 
 from serial import PortNotOpenError, SerialException, SerialTimeoutException
@@ -116,17 +118,24 @@ class Serial(SerialBase):
 
     def reset_input_buffer(self) -> None:
         """Throw away what was not read."""
-        self._device.advance(self._now_s())
+        self._now_s()
+        self._require_cable()
         self._device.forget_input()
 
     def reset_output_buffer(self) -> None:
         """Nothing to do: what was written is on the wire."""
         self._now_s()
+        self._require_cable()
 
     def _now_s(self) -> float:
         if not self.is_open:
             raise PortNotOpenError()
         return self._clock.now_s()
+
+    def _require_cable(self) -> None:
+        """Raise ``termios.error``, as flushing a port does whose cable came out."""
+        if self._gone():
+            raise termios.error(errno.EIO, os.strerror(errno.EIO))
 
     def _gone(self) -> bool:
         """Whether the cable came out since the port was opened; a cable that is back needs a fresh open."""

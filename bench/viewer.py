@@ -1,0 +1,197 @@
+"""The browser page in numbers: how soon a drag is followed, how many updates every viewer gets, how much memory it takes in the long run.
+
+python bench/viewer.py drags=300 viewers=4 seconds=20 steps=10000 minutes=10 policy=exact results=bench/results
+
+The viewers are programs that speak viser's protocol, in this process; the page is served by another one, ``marl-handover view``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import io
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import numpy as np
+from common import ROOT, commit, machine, parse, table
+from viewer_client import Client
+
+from marl_handover import cli
+from marl_handover.cell import load_cell
+from marl_handover.viewer.units import flat
+
+DEFAULTS = {
+    "drags": 300,
+    "viewers": 4,
+    "seconds": 20,
+    "steps": 10000,
+    "minutes": 10,
+    "policy": "exact",
+    "seed": 0,
+    "results": "bench/results",
+}
+LIMIT_MS, LIMIT_HZ = 100.0, 20.0
+SCRUB_HZ = 30.0
+UPDATE_S = 1 / 60
+"""What comes within this is one update: the server sends no more often."""
+
+
+@contextlib.contextmanager
+def page(*arguments: str) -> Iterator[tuple[str, int]]:
+    """A page in a process of its own: its address and the process."""
+    command = [sys.executable, "-m", "marl_handover.cli", "view", "port=0", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}) as process:
+        assert process.stdout is not None
+        try:
+            yield process.stdout.readline().split()[1], process.pid
+        finally:
+            process.terminate()
+
+
+@contextlib.contextmanager
+def watched(address: str, viewers: int) -> Iterator[list[Client]]:
+    """So many viewers, all of whom have seen the cell."""
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(Client(address)) for _ in range(viewers)]
+        for client in clients:
+            client.wait(lambda client=client: "position" in client.nodes.get("/goal", {}), 60)  # type: ignore[misc]
+        yield clients
+
+
+def places(count: int, seed: int) -> np.ndarray:
+    """Poses (count, 3) that the paper's arms reach."""
+    cell, random = load_cell(), np.random.default_rng(seed)
+    poses = random.uniform([-230, -180, -np.pi], [230, 180, np.pi], (20 * count, 3))
+    return poses[cell.reaches(poses).any(-1)][:count]
+
+
+def drag(client: Client, pose: np.ndarray) -> float:
+    """Drag the goal to ``pose``; the ms until the page shows it there, which it does with the first sample of the new motion."""
+    wxyz, position = (part.tolist() for part in flat(pose, 8.0))
+    begun = time.perf_counter()
+    client.drag("/goal_handle", position, wxyz)
+    client.drag("/goal_handle", position, wxyz, "end")
+    there = client.wait(lambda: np.hypot(*(np.asarray(client.nodes["/goal"]["position"][:2]) - position[:2])) < 1e-6, 30)
+    return 1e3 * (there - begun)
+
+
+def drags(client: Client, count: int, seed: int) -> list[float]:
+    """Latencies in ms of drags at random moments, most of them in mid-motion."""
+    random = np.random.default_rng(seed)
+    times = []
+    for pose in places(count, seed):
+        time.sleep(random.uniform(0.05, 1.0))
+        times.append(drag(client, pose))
+    return times
+
+
+def updates(clients: list[Client], seconds: float, meanwhile: Callable[[float], None] = time.sleep) -> list[float]:
+    """Updates a second that each viewer gets while ``meanwhile`` goes on for so many seconds."""
+    before = [len(client.frames) for client in clients]
+    begun = time.perf_counter()
+    meanwhile(seconds)
+    spent = time.perf_counter() - begun
+    gaps = [np.diff(client.frames[first:]) for client, first in zip(clients, before, strict=True)]
+    return [float((gap > UPDATE_S / 4).sum()) / spent for gap in gaps]
+
+
+def scrubbed(client: Client, seconds: float) -> None:
+    """Somebody pulls the slider to and fro."""
+    slider = client.input("moment")
+    end, share = time.perf_counter() + seconds, 0.0
+    last = client.panel[slider]["max"]
+    while time.perf_counter() < end:
+        share = (share + 0.37 / SCRUB_HZ) % 1.0
+        client.set("moment", round(share * last))
+        time.sleep(1 / SCRUB_HZ)
+
+
+def memory_mb(pid: int) -> float:
+    """Resident memory of a process."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return float(next(line.split()[1] for line in lines if line.startswith("VmRSS"))) / 1024
+
+
+def long_trace(folder: Path, steps: int) -> Path:
+    """A trace of at least so many transfers."""
+    path = folder / "trace.jsonl"
+    with contextlib.redirect_stdout(io.StringIO()):
+        cli.main(["evaluate", "policy=exact", f"episodes={steps // 2}", f"trace={path}", "progress=false"])
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:steps]))
+    return path
+
+
+def in_the_long_run(pages: list[tuple[str, int]], viewers: int, minutes: float, seed: int) -> list[list[float]]:
+    """Memory in MB of each page's process, once before and then every minute, while the goal is dragged and the trace is scrubbed."""
+    seen = [[memory_mb(pid)] for _, pid in pages]
+    with contextlib.ExitStack() as stack:
+        play, trace = (stack.enter_context(watched(address, viewers)) for address, _ in pages)
+        for minute in range(round(minutes)):
+            end = time.perf_counter() + 60
+            while time.perf_counter() < end:
+                drags(play[0], 3, seed + minute)
+                scrubbed(trace[0], 2.0)
+                for client in (*play, *trace):
+                    client.frames.clear()
+            for row, (_, pid) in zip(seen, pages, strict=True):
+                row.append(memory_mb(pid))
+            print(f"minute {minute + 1}: play {seen[0][-1]:.0f} MB, trace {seen[1][-1]:.0f} MB", flush=True)
+    return seen
+
+
+def main(arguments: list[str]) -> None:
+    settings = parse(arguments, DEFAULTS)
+    results: dict[str, Any] = {"settings": settings, "machine": machine(1), "commit": commit()}
+    with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
+        trace = long_trace(Path(name), settings["steps"])
+        playing = stack.enter_context(page(f"policy={settings['policy']}", f"seed={settings['seed']}"))
+        with watched(playing[0], 1) as clients:
+            results["drag_ms"] = drags(clients[0], settings["drags"], settings["seed"])
+        with watched(playing[0], settings["viewers"]) as clients:
+            results["updates_play_hz"] = updates(clients, settings["seconds"])
+            results["drag_crowded_ms"] = drags(clients[0], settings["drags"] // 3, settings["seed"] + 1)
+        scrubbing = stack.enter_context(page(f"trace={trace}"))
+        with watched(scrubbing[0], settings["viewers"]) as clients:
+            results["updates_trace_hz"] = updates(clients, settings["seconds"], partial(scrubbed, clients[0]))
+        results["memory_mb"] = in_the_long_run([playing, scrubbing], settings["viewers"], settings["minutes"], settings["seed"])
+    tell(results)
+    folder = ROOT / settings["results"] / datetime.date.today().isoformat()
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "viewer.json").write_text(json.dumps(results, indent=1) + "\n")
+
+
+def tell(results: dict[str, Any]) -> None:
+    settings, rows = results["settings"], []
+    for key, viewers in (("drag_ms", 1), ("drag_crowded_ms", settings["viewers"])):
+        for q in (50, 95, 99):
+            time_ms = float(np.percentile(results[key], q))
+            what = f"drag to first new motion, {viewers} looking, p{q}"
+            rows.append([what, f"{time_ms:.0f} ms", f"{time_ms / LIMIT_MS:.2f} of {LIMIT_MS:.0f} ms"])
+    for what in ("play", "trace"):
+        least = min(results[f"updates_{what}_hz"])
+        rows.append(
+            [
+                f"updates to each of {settings['viewers']} viewers, {what}",
+                f"{least:.0f} / s",
+                f"{least / LIMIT_HZ:.1f} of {LIMIT_HZ:.0f} / s",
+            ]
+        )
+    for what, memory in zip(("play", "trace"), results["memory_mb"], strict=True):
+        first = memory[min(1, len(memory) - 1)]
+        rows.append([f"memory, minutes 1 to {len(memory) - 1}, {what}", f"{memory[-1]:.0f} MB", f"{memory[-1] - first:+.0f} MB"])
+    print(table(["what", "measured", "against the limit"], rows))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,197 @@
+"""Reading what a :class:`~marl_handover.runtime.publishing.Publisher` writes, and asking for things, from another process."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from marl_handover.errors import CorruptFile, InvalidSetting, WorkFailed
+from marl_handover.files import write_whole
+from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.settings import HardwareConfig
+from marl_handover.perception.calibration import Pixels
+from marl_handover.perception.overlay import read_picture
+from marl_handover.runtime.steering import CONTROL_FILE, Ask
+
+STATE_FILE, PICTURE_FILE, EVENTS_FILE = "state.json", "picture.jpg", "events.jsonl"
+FORMAT, VERSION = "marl-handover live", 1
+
+SILENT_S = 2.0
+"""No news for longer than this is said."""
+
+_TAIL_BYTES = 65536
+
+
+class NotSteerable(WorkFailed):
+    """A session was asked for something that it does not take from a page."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"the session cannot be asked: {reason}")
+
+
+class Reading(NamedTuple):
+    """What the folder says.
+
+    ``state``: the newest one there was, also from before something went wrong; None: never any. ``live``: whether the session goes on and
+    is heard of. ``problem``: what is wrong, for people; empty if nothing is. ``age_s``: of the state.
+    """
+
+    state: dict[str, Any] | None
+    live: bool
+    problem: str
+    age_s: float
+
+
+class Feed:
+    """A folder that a session publishes in. Nothing that is in there, or not, makes reading raise.
+
+    Args:
+        folder: it may come later, and go.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        self.folder = Path(folder)
+        self._state: dict[str, Any] | None = None
+        self._picture: tuple[int, int] | None = None
+        self._events_of, self._offset = "", 0
+        self._number = 0
+
+    def read(self) -> Reading:
+        """The newest state."""
+        trouble = ""
+        try:
+            self._state = _checked(json.loads((self.folder / STATE_FILE).read_bytes()), self.folder / STATE_FILE)
+        except FileNotFoundError:
+            trouble = f"{self.folder} holds no session yet" if self._state is None else f"{self.folder} was emptied or taken away"
+        except (OSError, ValueError, RecursionError, CorruptFile) as error:
+            trouble = str(error) if isinstance(error, CorruptFile) else f"the state file cannot be read: {error}"
+        state = self._state
+        if state is None:
+            return Reading(None, False, trouble, 0.0)
+        age_s = max(time.time() - state["time"], 0.0)
+        if state["over"]:
+            return Reading(state, False, "", age_s)
+        if _gone(state):
+            return Reading(
+                state, False, f"process {state['pid']} is gone: the session broke off, its arms hold where they were sent", age_s
+            )
+        if age_s > SILENT_S:
+            return Reading(state, False, f"no news for {age_s:.0f} s{'; ' if trouble else ''}{trouble}", age_s)
+        return Reading(state, True, trouble, age_s)
+
+    def picture(self) -> Pixels | None:
+        """The newest picture, RGB (height, width, 3); None if there is none that was not given already, or it cannot be read."""
+        path = self.folder / PICTURE_FILE
+        try:
+            found = path.stat()
+            mark = (found.st_mtime_ns, found.st_ino)
+            if mark == self._picture:
+                return None
+            image = read_picture(path)
+        except (OSError, CorruptFile):
+            return None
+        self._picture = mark
+        return image
+
+    def events(self) -> list[dict[str, Any]]:
+        """The events that came since the last call, oldest first; of a long log, the end. A line that is none says so."""
+        session = "" if self._state is None else str(self._state["session"])
+        path = self.folder / EVENTS_FILE
+        try:
+            size = path.stat().st_size
+            if session != self._events_of or size < self._offset:
+                self._events_of, self._offset = session, max(0, size - _TAIL_BYTES)
+            with path.open("rb") as stream:
+                stream.seek(self._offset)
+                content = stream.read(_TAIL_BYTES)
+        except OSError:
+            return []
+        whole = content[: content.rfind(b"\n") + 1] or (content if len(content) == _TAIL_BYTES else b"")
+        inside = self._offset > 0 and self._offset == size - _TAIL_BYTES
+        self._offset += len(whole)
+        return [_row(line) for line in whole.splitlines()[1 if inside else 0 :] if line.strip()]
+
+    def ask(self, command: str, goal: list[float] | None = None) -> int:
+        """Ask the session to start, pause, resume, or take another ``goal`` (x_mm, y_mm, theta_rad); the number of the request.
+
+        The state's ``control`` tells what came of it.
+
+        Raises:
+            NotSteerable: there is no session, or it takes nothing from pages, or the folder cannot be written.
+            InvalidSetting: there is no such command.
+        """
+        if command not in list(Ask):
+            raise InvalidSetting("command", command, f"one of: {', '.join(Ask)}")
+        reading = self.read()
+        if reading.state is None or not reading.live:
+            raise NotSteerable(reading.problem or "it is over")
+        if not reading.state["view_control"]:
+            raise NotSteerable("it was started without view_control=true; it can only be stopped")
+        self._number = max(self._number + 1, time.time_ns() // 1_000_000)
+        asked = {"session": reading.state["session"], "number": self._number, "time": time.time(), "command": command, "goal": goal}
+        try:
+            write_whole(self.folder / CONTROL_FILE, json.dumps(asked))
+        except OSError as error:
+            raise NotSteerable(f"{error.strerror or error}") from error
+        return self._number
+
+    def latch(self) -> StopLatch:
+        """The stop of this session; before any state was read, the usual one."""
+        path = (self._state or {}).get("stop_file") or HardwareConfig().stop_path()
+        return StopLatch(str(path))
+
+    def stop(self, reason: str) -> str:
+        """Latch the stop: allowed whatever ``view_control`` says. What was done, for people.
+
+        If the latch cannot be written, the session's process is interrupted, which stops every channel too.
+        """
+        reading = self.read()
+        latch = self.latch()
+        try:
+            latch.latch(reason)
+            return f"stop latched in {latch.path}"
+        except OSError as error:
+            failed = f"the stop file {latch.path} cannot be written ({error.strerror or error})"
+        if reading.live and reading.state is not None:
+            with contextlib.suppress(OSError):
+                os.kill(int(reading.state["pid"]), signal.SIGINT)
+                return f"{failed}; interrupted process {reading.state['pid']} instead"
+        return f"{failed}: CUT THE POWER"
+
+
+def _checked(content: Any, path: Path) -> dict[str, Any]:
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise CorruptFile("state file", path, "no session wrote it")
+    if content.get("version") != VERSION:
+        raise CorruptFile("state file", path, f"it has version {content.get('version')}, this package reads {VERSION}")
+    kinds = {"session": str, "pid": int, "time": int | float, "over": bool, "view_control": bool, "doing": str, "text": str}
+    for name, kind in kinds.items():
+        if not isinstance(content.get(name), kind):
+            raise CorruptFile("state file", path, f"its {name} is {content.get(name)!r}")
+    return content
+
+
+def _gone(state: dict[str, Any]) -> bool:
+    """Whether the session's process is known not to run any more."""
+    if state.get("host") != os.uname().nodename:
+        return False
+    try:
+        os.kill(state["pid"], 0)
+    except ProcessLookupError:
+        return True
+    except (OSError, OverflowError):
+        return False
+    return False
+
+
+def _row(line: bytes) -> dict[str, Any]:
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        row = None
+    return row if isinstance(row, dict) and "event" in row else {"t_s": None, "event": "a damaged line"}

@@ -1,0 +1,84 @@
+"""The files of a servo calibration: one for each arm and the play. Only those of one calibration mean anything together."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+from numpy.typing import ArrayLike
+
+from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
+from marl_handover.files import keep, write_whole
+from marl_handover.hardware.calibration import ArmCalibration, CalibrationProblem
+from marl_handover.hardware.settings import ARMS
+from marl_handover.runtime.play import FILE as PLAY_FILE
+from marl_handover.runtime.play import save_play
+
+SET_FILE = "servos.json"
+"""Names the others' content, so that files of two calibrations are told from those of one."""
+
+VERSION = 1
+_AGAIN = "run: marl-handover calibrate what=servos"
+
+
+def arm_file(arm: str) -> str:
+    """The name of an arm's file."""
+    return f"{arm}.json"
+
+
+NAMES = (*(arm_file(arm) for arm in ARMS), PLAY_FILE)
+
+
+def save_servos(folder: Path, arms: Mapping[str, ArmCalibration], half_us: Mapping[str, ArrayLike], sd_us: Mapping[str, ArrayLike]) -> None:
+    """Write what was found for all arms into ``folder``; what was there is kept beside it. The last file makes the others valid.
+
+    Args:
+        folder: where; made if it is missing.
+        arms: calibration of each arm.
+        half_us: half the dead bands (5,) in us of each arm's servos.
+        sd_us: their standard deviations (5,).
+
+    Raises:
+        InvalidSetting: if they cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        keep(folder / PLAY_FILE)
+        keep(folder / SET_FILE)
+        for arm in ARMS:
+            arms[arm].save(folder / arm_file(arm))
+        save_play(folder, half_us, sd_us)
+        content = {"version": VERSION, "sha256": {name: _digest(folder / name) for name in NAMES}}
+        write_whole(folder / SET_FILE, json.dumps(content, indent=1) + "\n")
+    except OSError as error:
+        raise InvalidSetting("calibration", str(folder), f"a folder that can be written ({error.strerror or error})") from error
+
+
+def require_one_set(folder: Path, names: Collection[str] = NAMES) -> None:
+    """See that the files ``names`` in ``folder`` come from one calibration.
+
+    Raises:
+        MissingFile: one is not there.
+        CorruptFile: the one that names the others cannot be read.
+        CalibrationProblem: they do not belong together, or were changed since.
+    """
+    for name in (*names, SET_FILE):
+        if not (folder / name).is_file():
+            raise MissingFile("servo calibration", folder / name, _AGAIN)
+    path = folder / SET_FILE
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["version"] != VERSION:
+            raise CorruptFile("servo calibration", path, f"it has version {content['version']!r}, this program reads {VERSION}; {_AGAIN}")
+        wanted = {name: str(content["sha256"][name]) for name in names}
+        others = [name for name in names if _digest(folder / name) != wanted[name]]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise CorruptFile("servo calibration", path, f"{type(error).__name__}: {error}") from error
+    if others:
+        raise CalibrationProblem(str(folder), f"{' and '.join(others)} changed since the others were written; {_AGAIN}")
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

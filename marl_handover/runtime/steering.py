@@ -1,0 +1,171 @@
+"""What people at a page may ask of a session: pause, go on, another goal. Wishes only: nothing here makes an arm move.
+
+A :class:`ControlFile` reads them in one thread and leaves them on the :class:`Desk`, where the session's own thread finds them when it
+is about to begin a transfer.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+CONTROL_FILE = "control.json"
+
+MAX_AGE_S = 2.0
+"""A command older than this is refused: whoever gave it saw another situation."""
+
+_POLL_S = 0.02
+_LARGEST_BYTES = 4096
+_LARGEST = 1e12
+"""No number in a command is larger; infinity is, and what is not a number is not smaller."""
+
+_ANSWERS = 100
+
+
+class Ask(StrEnum):
+    """What may be asked."""
+
+    START = "start"
+    PAUSE = "pause"
+    RESUME = "resume"
+    GOAL = "goal"
+
+
+class Answer(NamedTuple):
+    """What came of a command: its number, what it was, the goal (3,) it gave, and why it was refused (None: it was not)."""
+
+    number: int
+    command: str
+    goal: list[float] | None
+    refused: str | None
+
+
+class Desk:
+    """Where the wishes lie. Set by one thread, read by the session's.
+
+    Args:
+        paused: whether the session has to be started by somebody.
+    """
+
+    def __init__(self, paused: bool = False) -> None:
+        self._go = threading.Event()
+        self._answers: deque[Answer] = deque(maxlen=_ANSWERS)
+        self.goal: Floats | None = None
+        """Where the block is to go (3,), if somebody has said so."""
+        if not paused:
+            self._go.set()
+
+    @property
+    def paused(self) -> bool:
+        """Whether no transfer is to begin."""
+        return not self._go.is_set()
+
+    def take(self, answer: Answer) -> None:
+        """Take note of a command and, unless it was refused, of what it asks."""
+        self._answers.append(answer)
+        if answer.refused is not None:
+            return
+        if answer.command == Ask.PAUSE:
+            self._go.clear()
+        elif answer.command == Ask.GOAL:
+            self.goal = np.array(answer.goal, float)
+        else:
+            self._go.set()
+
+    def answers(self) -> list[Answer]:
+        """What was taken note of since the last call."""
+        return [self._answers.popleft() for _ in range(len(self._answers))]
+
+    def wait(self, obey: Callable[[], None]) -> None:
+        """Wait for as long as the session is paused; ``obey`` is called all the while, and may raise. There is no other limit."""
+        while not self._go.wait(_POLL_S):
+            obey()
+
+
+class ControlFile:
+    """Reads commands from a file that others replace.
+
+    Args:
+        path: of the file.
+        session: only commands to the session of this name are taken.
+        unreachable: says of a goal (3,) why it cannot be, or None.
+    """
+
+    def __init__(self, path: Path, session: str, unreachable: Callable[[Floats], str | None]) -> None:
+        self._path, self._session, self._unreachable = path, session, unreachable
+        self._began_s = time.time()
+        self._known: tuple[int, int] | None = None
+        self._number = -1
+
+    def poll(self) -> Answer | None:
+        """The answer to a command that is new; None if there is none. Whatever the file holds, this does not raise."""
+        try:
+            found = os.stat(self._path)
+            mark = (found.st_mtime_ns, found.st_ino)
+            if mark == self._known:
+                return None
+            self._known = mark
+            if not stat.S_ISREG(found.st_mode):  # reading a pipe could take for ever
+                return Answer(-1, "", None, "the control file is no file")
+            if found.st_uid != os.getuid():
+                return Answer(-1, "", None, "the control file belongs to somebody else")
+            with self._path.open("rb") as stream:
+                content = json.loads(stream.read(_LARGEST_BYTES))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, RecursionError) as error:
+            return Answer(-1, "", None, f"the control file cannot be read: {error}"[:200])
+        return self._judged(content)
+
+    def _judged(self, content: Any) -> Answer:
+        fields = content if isinstance(content, dict) else {}
+        command, goal = fields.get("command"), fields.get("goal")
+        number = given if type(given := fields.get("number")) is int else -1
+        answer = Answer(number, str(command)[:20], None, None)
+        if number < 0 or command not in list(Ask):
+            return answer._replace(refused=f"a command needs a number, and to be one of: {', '.join(Ask)}")
+        if fields.get("session") != self._session:
+            return answer._replace(refused="it was meant for another session")
+        if number <= self._number:
+            return answer._replace(refused="a later command was seen already")
+        self._number = number
+        if (late := self._late(fields.get("time"))) is not None:
+            return answer._replace(refused=late)
+        if command != Ask.GOAL:
+            return answer
+        if not _is_pose(goal):
+            return answer._replace(refused="a goal is x_mm, y_mm, theta_rad")
+        pose = np.array(goal, float)
+        return answer._replace(goal=pose.tolist(), refused=self._unreachable(pose))
+
+    def _late(self, given_s: Any) -> str | None:
+        """Why a command given at ``given_s`` (s since 1970) is not for now."""
+        if not _is_number(given_s):
+            return "it does not say when it was given"
+        if given_s < self._began_s:
+            return "it is older than this session"
+        age_s = time.time() - given_s
+        if abs(age_s) > MAX_AGE_S:
+            return f"it is {age_s:.1f} s old, more than {MAX_AGE_S:g} s" if age_s > 0 else "it comes from the future: compare the clocks"
+        return None
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LARGEST
+
+
+def _is_pose(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(_is_number(item) for item in value)

@@ -1,0 +1,245 @@
+"""The page on which a session with real arms, or the twin's, is watched and, if it allows that, steered.
+
+The session is another process. All that joins them is the folder it publishes in, so that nothing that happens here reaches it but what
+a :class:`~marl_handover.runtime.feed.Feed` asks for.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from marl_handover.cell import CellModel, build_cell
+from marl_handover.cell.cell import Cell
+from marl_handover.cell.kinematics import transform
+from marl_handover.config import BlockConfig, CellConfig
+from marl_handover.errors import HandoverError
+from marl_handover.perception.calibration import flat_pose
+from marl_handover.runtime.feed import Feed, Reading
+from marl_handover.runtime.steering import Ask
+from marl_handover.viewer import live_words
+from marl_handover.viewer.scene import CellScene
+
+Floats = NDArray[np.float64]
+
+LOG_LINES = 30
+STOP_REASON = "STOP pressed in the browser"
+ANSWER_S = 1.0
+"""A session that has not obeyed a stop by then does not run, or hangs."""
+
+FRESH_S = 1.0
+"""A picture that is older than this says so."""
+
+_EMPTY_PX = (360, 640, 3)
+_OPEN_MM = 4.0
+_PUT_DOWN = ("release", "retreat")
+
+
+class LivePage:
+    """Shows what a folder tells of a session.
+
+    Args:
+        server: of the page.
+        scene: of the session's cell, as far as that is known. None, or of another cell: it is built when the session says what it is.
+        feed: of the folder.
+    """
+
+    def __init__(self, server: viser.ViserServer, scene: CellScene | None, feed: Feed) -> None:
+        self.server, self.scene, self.feed = server, scene, feed
+        self._said: dict[str, str] = {}
+        self._events: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
+        self._session = self._trouble = ""
+        self._stopping: tuple[float, str] | None = None
+        self._held: Floats | None = None
+        self._add_controls()
+
+    def update(self, dt_s: float = 0.0) -> None:
+        """Show the newest state; to be called at most 20 times a second, from one thread."""
+        reading = self.feed.read()
+        if reading.state is not None and reading.state["session"] != self._session:
+            self._begin(reading.state)
+        self._events.extend(self.feed.events())
+        picture = self.feed.picture()
+        with self.server.atomic():
+            if picture is not None:
+                self._camera.image = picture
+            if reading.state is not None and self.scene is not None:
+                self._show(self.scene, reading.state)
+            self._tell(reading)
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        gui.add_html(live_words.BIG_RED)
+        self._headline = gui.add_html("")
+        stop = gui.add_button("STOP", color="red", hint="stops every servo where it is; cleared only at the cell, by hand")
+        self._stop_note = gui.add_html("")
+        self._start = gui.add_button("start", disabled=True)
+        self._pause = gui.add_button("pause", disabled=True, hint="no new transfer begins; the one that goes on is finished")
+        self._steering = gui.add_html("")
+        with gui.add_folder("another goal", expand_by_default=False):
+            self._goal = gui.add_vector3("x, y [mm], turn [°]", (0.0, 0.0, 0.0), step=1.0)
+            self._send = gui.add_button("send goal", disabled=True)
+        self._camera = gui.add_image(np.full(_EMPTY_PX, 60, np.uint8), label="camera: no picture yet")
+        self._facts = gui.add_html("")
+        with gui.add_folder("arms"):
+            self._arms = gui.add_html("")
+        with gui.add_folder("next hand-overs"):
+            self._plan = gui.add_html("")
+        with gui.add_folder("events, newest first"):
+            self._log = gui.add_html("")
+        stop.on_click(lambda _: self.stop())
+        self._start.on_click(lambda _: self._ask(Ask.START))
+        self._pause.on_click(lambda _: self._ask(Ask.PAUSE))
+        self._send.on_click(lambda _: self._ask(Ask.GOAL))
+
+    def stop(self) -> None:
+        """Latch the stop. From any thread; it does not wait for anything on this page."""
+        self._stopping = (time.monotonic(), self.feed.stop(STOP_REASON))
+
+    def _ask(self, command: Ask) -> None:
+        x_mm, y_mm, turn_deg = self._goal.value
+        goal = [x_mm, y_mm, math.radians(turn_deg)] if command is Ask.GOAL else None
+        try:
+            self.feed.ask(command, goal)
+            self._trouble = ""
+        except HandoverError as error:
+            self._trouble = str(error)
+
+    def _begin(self, state: dict[str, Any]) -> None:
+        """Another session: another log, maybe another cell."""
+        wanted = _cell_config(state)
+        if wanted is None:
+            return
+        self._session, self._held, self._stopping = state["session"], None, None
+        self._events.clear()
+        if self.scene is not None and self.scene.model.cell.config == wanted:
+            return
+        self._said.pop("joints", None)
+        try:
+            model = build_cell(wanted)
+            self.server.scene.reset()
+            self.scene = CellScene(self.server, model)
+        except (HandoverError, OSError) as error:
+            self._trouble = f"the session's cell cannot be shown: {error}"
+
+    def _show(self, scene: CellScene, state: dict[str, Any]) -> None:
+        arms = state.get("arms", ())
+        known = [arm["joints_rad"] for arm in arms]
+        if known and all(joints is not None for joints in known):
+            opened = [arm["gripper_mm"] is None or arm["gripper_mm"] > _OPEN_MM for arm in arms]
+            scene.show_joints(np.array(known), opened)
+        elif not self._said.get("joints") and state.get("parked_rad"):
+            self._said["joints"] = "parked"
+            scene.show_joints(np.tile(state["parked_rad"], (scene.model.cell.num_arms, 1)))
+        scene.show_block(self._block(scene.model, state))
+        scene.show_goal(state.get("goal"))
+        steps = state.get("plan", ())
+        scene.show_plan([step["pose"] for step in steps], [step["arm"] for step in steps])
+
+    def _block(self, model: CellModel, state: dict[str, Any]) -> Floats | None:
+        """T_world_block (4, 4): where it was seen; in the hand, as that took it from there; then where that put it."""
+        pose = (state.get("block") or {}).get("pose")
+        if pose is None:
+            return None
+        holder = next((index for index, arm in enumerate(state["arms"]) if arm["holding"] and arm["joints_rad"] is not None), None)
+        if holder is not None:
+            base = model.cell.bases[holder]
+            T_world_base = flat_pose(base.x_mm, base.y_mm, base.facing_rad)
+            now = T_world_base @ model.arm.fk(np.array(state["arms"][holder]["joints_rad"], float))
+            self._held = now @ np.linalg.inv(_picking(model.cell, holder, pose)) @ flat_pose(*pose)
+            return self._held
+        if state["phase"] in _PUT_DOWN and state["doing"] == "moving":
+            if self._held is not None:
+                return _lying(self._held)
+            return flat_pose(*(state["plan"][0]["pose"] if state.get("plan") else pose))
+        self._held = None
+        return flat_pose(*pose)
+
+    def _tell(self, reading: Reading) -> None:
+        """Texts and buttons, where they have changed."""
+        state = reading.state
+        self._say("headline", self._headline, live_words.headline(reading))
+        self._say("stop", self._stop_note, live_words.note(self._stop_words(reading)))
+        if state is None:
+            return
+        steered = bool(state["view_control"]) and reading.live
+        waiting = bool(state.get("pausing"))
+        for handle, usable in ((self._start, steered and waiting), (self._pause, steered and not waiting), (self._send, steered)):
+            if handle.disabled == usable:
+                handle.disabled = not usable
+        self._say("steering", self._steering, live_words.note(self._trouble or _steering_words(reading)))
+        if "episode" not in state:
+            return
+        label = _camera_label(reading)
+        if self._camera.label != label:
+            self._camera.label = label
+        self._say("facts", self._facts, live_words.facts(state))
+        self._say("arms", self._arms, live_words.arms(state))
+        self._say("plan", self._plan, live_words.plan(state))
+        self._say("log", self._log, live_words.log(self._events))
+
+    def _stop_words(self, reading: Reading) -> str:
+        """What became of a stop that was asked for here."""
+        if self._stopping is None:
+            return ""
+        asked_s, done = self._stopping
+        pid = self.feed.latch().obeyed_by()
+        if pid is not None:
+            return f"{done}; process {pid} has stopped its arms"
+        if reading.state is not None and reading.state["over"]:
+            return f"{done}; the session is over"
+        return f"{done}; no session has answered: if arms move, CUT THE POWER" if time.monotonic() - asked_s > ANSWER_S else done
+
+    def _say(self, key: str, handle: viser.GuiHtmlHandle, text: str) -> None:
+        if self._said.get(key) != text:
+            self._said[key] = handle.content = text
+
+
+def _steering_words(reading: Reading) -> str:
+    state = reading.state
+    assert state is not None
+    if not reading.live:
+        return ""
+    if not state["view_control"]:
+        return "Watching only: the session was started without view_control=true. STOP works."
+    answer = state.get("control")
+    if answer and answer["refused"]:
+        return f"{answer['command']} was refused: {answer['refused']}"
+    return f"{answer['command']}: done" if answer else ""
+
+
+def _camera_label(reading: Reading) -> str:
+    state = reading.state or {}
+    age_s = state.get("picture_s_ago")
+    if not state.get("picture") or age_s is None:
+        return "camera: no picture yet"
+    if not reading.live:
+        return "camera: the last picture"
+    return "camera" if age_s < FRESH_S else f"camera, {age_s:.0f} s ago"
+
+
+def _cell_config(state: dict[str, Any]) -> CellConfig | None:
+    """The session's cell; None as long as it has not said."""
+    try:
+        cell = dict(state["cell"])
+        return CellConfig(**{**cell, "block": BlockConfig(**cell["block"])})
+    except (KeyError, TypeError):
+        return None
+
+
+def _picking(cell: Cell, arm: int, pose: list[float]) -> Floats:
+    """T_world_grip (4, 4) of an arm that takes the block at ``pose`` (3,): level, at the height where blocks are held."""
+    yaw = float(cell.gripper_yaw(cell.polar(np.array(pose[:2], float))[1])[arm])
+    return transform((pose[0], pose[1], cell.config.pick_height_mm), (0.0, 0.0, yaw))
+
+
+def _lying(T_world_block: Floats) -> Floats:
+    """The same block on the table."""
+    yaw = math.atan2(T_world_block[1, 0], T_world_block[0, 0])
+    return flat_pose(float(T_world_block[0, 3]), float(T_world_block[1, 3]), yaw)

@@ -1,0 +1,198 @@
+"""Reading a session's folder: whatever is in there, or is not, it is said and nothing is raised."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from marl_handover.errors import InvalidSetting
+from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.settings import HardwareConfig
+from marl_handover.perception.overlay import jpeg
+from marl_handover.runtime.feed import EVENTS_FILE, FORMAT, PICTURE_FILE, SILENT_S, STATE_FILE, VERSION, Feed, NotSteerable
+from marl_handover.runtime.steering import CONTROL_FILE, ControlFile
+
+
+def state(**fields):
+    usual = {
+        "format": FORMAT,
+        "version": VERSION,
+        "session": "abc",
+        "pid": os.getpid(),
+        "host": os.uname().nodename,
+        "time": time.time(),
+        "over": False,
+        "view_control": False,
+        "doing": "moving",
+        "text": "",
+    }
+    return usual | fields
+
+
+def put(folder, content):
+    (folder / STATE_FILE).write_text(content if isinstance(content, str) else json.dumps(content))
+
+
+def test_a_session_that_goes_on_is_live(tmp_path):
+    put(tmp_path, state())
+    reading = Feed(tmp_path).read()
+    assert reading.live
+    assert reading.problem == ""
+    assert reading.state["doing"] == "moving"
+
+
+def test_nothing_there_is_said(tmp_path):
+    reading = Feed(tmp_path / "nowhere").read()
+    assert (reading.state, reading.live) == (None, False)
+    assert "no session yet" in reading.problem
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        ("{", "cannot be read"),
+        ("", "cannot be read"),
+        ("[1, 2]", "no session wrote it"),
+        (json.dumps({"format": "else"}), "no session wrote it"),
+        (state(version=99), "version 99"),
+        (state(pid="1"), "its pid"),
+        (state(time=None), "its time"),
+    ],
+)
+def test_a_damaged_state_is_said_and_the_last_good_one_kept(tmp_path, content, word):
+    put(tmp_path, content)
+    fresh = Feed(tmp_path).read()
+    assert fresh.state is None
+    assert word in fresh.problem
+    feed = Feed(tmp_path)
+    put(tmp_path, state(doing="looking"))
+    feed.read()
+    put(tmp_path, content)
+    kept = feed.read()
+    assert kept.state["doing"] == "looking"
+    assert word in kept.problem
+
+
+@given(content=st.binary(max_size=300))
+def test_whatever_bytes_are_in_the_files_nothing_is_raised(tmp_path_factory, content):
+    folder = tmp_path_factory.getbasetemp()
+    for name in (STATE_FILE, EVENTS_FILE, PICTURE_FILE):
+        (folder / name).write_bytes(content)
+    feed = Feed(folder)
+    assert not feed.read().live
+    assert feed.picture() is None
+    assert all("event" in row for row in feed.events())
+
+
+def test_silence_and_an_emptied_folder_are_said(tmp_path):
+    put(tmp_path, state(time=time.time() - SILENT_S - 5))
+    feed = Feed(tmp_path)
+    reading = feed.read()
+    assert not reading.live
+    assert "no news for 7 s" in reading.problem
+    (tmp_path / STATE_FILE).unlink()
+    assert "emptied or taken away" in feed.read().problem
+
+
+def test_a_process_that_died_is_said(tmp_path):
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    put(tmp_path, state(pid=process.pid))
+    reading = Feed(tmp_path).read()
+    assert not reading.live
+    assert f"process {process.pid} is gone" in reading.problem
+    put(tmp_path, state(pid=process.pid, host="another-computer"))
+    assert Feed(tmp_path).read().live, "processes of another computer cannot be asked about"
+    put(tmp_path, state(pid=process.pid, over=True))
+    assert Feed(tmp_path).read().problem == "", "a session that ended may be gone"
+
+
+def test_events_come_once_whole_and_again_with_another_session(tmp_path):
+    path = tmp_path / EVENTS_FILE
+    put(tmp_path, state())
+    feed = Feed(tmp_path)
+    feed.read()
+    assert feed.events() == []
+    path.write_text('{"event": "a"}\n{"event": "b"}\n{"eve')
+    assert [row["event"] for row in feed.events()] == ["a", "b"]
+    with path.open("a") as stream:
+        stream.write('nt": "c"}\nnonsense\n')
+    assert [row["event"] for row in feed.events()] == ["c", "a damaged line"]
+    assert feed.events() == []
+    path.write_text('{"event": "d"}\n')
+    assert [row["event"] for row in feed.events()] == ["d"], "a file that became shorter is another one"
+    put(tmp_path, state(session="next"))
+    feed.read()
+    assert [row["event"] for row in feed.events()] == ["d"]
+
+
+def test_of_a_long_log_the_end_is_read(tmp_path):
+    put(tmp_path, state())
+    (tmp_path / EVENTS_FILE).write_text("".join(f'{{"event": "{number:06d}"}}\n' for number in range(20_000)))
+    feed = Feed(tmp_path)
+    feed.read()
+    rows = feed.events()
+    assert rows[-1]["event"] == "019999"
+    numbers = [int(row["event"]) for row in rows]
+    assert numbers == list(range(numbers[0], 20_000)), "no line is cut"
+
+
+def test_a_picture_is_given_once(tmp_path):
+    image = np.zeros((36, 64, 3), np.uint8)
+    image[..., 2] = 250  # BGR: red
+    (tmp_path / PICTURE_FILE).write_bytes(jpeg(image))
+    feed = Feed(tmp_path)
+    seen = feed.picture()
+    assert seen.shape == (36, 64, 3)
+    assert seen[..., 0].min() > 200
+    assert seen[..., 2].max() < 50
+    assert feed.picture() is None
+
+
+def test_a_session_is_asked_only_if_it_takes_wishes(tmp_path):
+    feed = Feed(tmp_path)
+    with pytest.raises(NotSteerable, match="no session yet"):
+        feed.ask("pause")
+    put(tmp_path, state())
+    with pytest.raises(NotSteerable, match="view_control"):
+        feed.ask("pause")
+    assert not (tmp_path / CONTROL_FILE).exists()
+    put(tmp_path, state(view_control=True))
+    with pytest.raises(InvalidSetting, match="start, pause"):
+        feed.ask("park")
+    control = ControlFile(tmp_path / CONTROL_FILE, "abc", lambda goal: None)
+    for command, goal in (("pause", None), ("goal", [1.0, 2.0, 3.0])):
+        number = feed.ask(command, goal)
+        assert control.poll() == (number, command, goal, None)
+    put(tmp_path, state(view_control=True, over=True))
+    with pytest.raises(NotSteerable, match="over"):
+        feed.ask("pause")
+
+
+def test_stop_goes_through_the_latch_that_the_session_names(tmp_path):
+    stop = tmp_path / "stop"
+    put(tmp_path, state(stop_file=str(stop)))
+    feed = Feed(tmp_path)
+    assert str(stop) in feed.stop("page")
+    assert StopLatch(stop).reason() == "page"
+    assert Feed(tmp_path / "nowhere").latch().path == StopLatch(HardwareConfig().stop_path()).path
+
+
+def test_a_latch_that_cannot_be_written_interrupts_the_session(tmp_path):
+    code = "import time\ntry:\n    print('up', flush=True)\n    time.sleep(60)\nexcept KeyboardInterrupt:\n    print('halted')"
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "up\n"
+    (tmp_path / "file").write_text("")
+    put(tmp_path, state(pid=process.pid, stop_file=str(tmp_path / "file" / "stop")))
+    feed = Feed(tmp_path)
+    assert f"interrupted process {process.pid}" in feed.stop("page")
+    assert process.communicate(timeout=30)[0] == "halted\n"
+    assert "CUT THE POWER" in feed.stop("page"), "nobody is left to be interrupted"

@@ -1,0 +1,178 @@
+"""The live page on a real server, fed with what real twin sessions published."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from marl_handover.cell import build_cell, cell_config
+from marl_handover.cli import main
+from marl_handover.config import TaskConfig
+from marl_handover.hardware.latch import StopLatch
+from marl_handover.perception.calibration import flat_pose
+from marl_handover.runtime.feed import EVENTS_FILE, STATE_FILE, Feed, Reading
+from marl_handover.task.rules import Command, Rules
+from marl_handover.viewer import live_words
+from marl_handover.viewer.live import LivePage, _picking
+from marl_handover.viewer.scene import CellScene
+
+
+@pytest.fixture(scope="module")
+def session(twin_calibration, tmp_path_factory):
+    """States and the picture of a whole episode, and its folder as it was left."""
+    folder, stop = tmp_path_factory.mktemp("session") / "live", tmp_path_factory.mktemp("stop") / "stop"
+    states, ended, feed = [], threading.Event(), Feed(folder)
+
+    def collect():
+        while not ended.wait(0.01):
+            state = feed.read().state
+            if state is not None and (not states or state["number"] != states[-1]["number"]):
+                states.append(state)
+
+    reader = threading.Thread(target=collect)
+    reader.start()
+    arguments = ["hardware=twin", f"calibration={twin_calibration}", f"hardware.stop_file={stop}", "policy=exact", "seed=3"]
+    assert main(["run", *arguments, f"publish={folder}"]) == 0
+    ended.set()
+    reader.join()
+    states.append(feed.read().state)
+    return SimpleNamespace(states=[state for state in states if "arms" in state], folder=folder)
+
+
+@pytest.fixture
+def page(server, tmp_path):
+    """A page on an empty folder, and ``show(state)``, which publishes that as of now."""
+    page = LivePage(server, None, Feed(tmp_path))
+
+    def show(state=None, **fields):
+        here = {"pid": os.getpid(), "time": time.time(), "over": False, "stop_file": str(tmp_path / "stop")}
+        (tmp_path / STATE_FILE).write_text(json.dumps({**(state or {}), **here, **fields}))
+        page.update()
+
+    page.show_state = show
+    return page
+
+
+def test_without_a_session_it_says_so_and_offers_nothing(page, tmp_path):
+    page.update()
+    assert "no session yet" in page._headline.content
+    assert all(button.disabled for button in (page._start, page._pause, page._send))
+    (tmp_path / STATE_FILE).write_text("{")
+    page.update()
+    assert "cannot be read" in page._headline.content
+
+
+def test_every_state_of_an_episode_can_be_shown(page, session):
+    said = set()
+    for state in session.states:
+        page.show_state(state, over=state["over"])
+        said.add(page._headline.content.split("<b>")[1].split("</b>")[0])
+    assert said & {"left arm carries the block", "right arm carries the block"}
+    assert "session ended" in said
+    assert "exact" in page._facts.content
+    moving = next(state for state in session.states if state["plan"] and state["phase"])
+    page.show_state(moving)
+    first = moving["plan"][0]
+    assert f"{('left', 'right')[first['arm']]} arm" in page._plan.content
+    assert page.scene.model.cell.config.name == "paper"
+
+
+def test_the_block_in_the_hand_stays_where_it_is_held(model, page, session):
+    """Carried from a place to another it turns as the rule book says."""
+    rules = Rules(model.cell, TaskConfig())
+    height = model.cell.config.pick_height_mm
+    random, tried = np.random.default_rng(0), 0
+    for _ in range(300):
+        arm = int(random.integers(2))
+        pose, place = np.array([*random.uniform(-150, 150, 2), random.uniform(-3, 3)]), random.uniform(-150, 150, 2)
+        placed, feasible = rules.transfer(pose, np.zeros(3), Command(np.bool_(False), np.int64(arm), place))
+        if not feasible:
+            continue
+        tried += 1
+        base = model.cell.bases[arm]
+        T_world_base = flat_pose(base.x_mm, base.y_mm, base.facing_rad)
+        for where, wanted in ((pose, pose), (placed, placed)):
+            grip = np.linalg.inv(T_world_base) @ [where[0], where[1], height, 1.0]
+            joints = model.arm.ik(grip[:3])[0]
+            np.testing.assert_allclose(T_world_base @ model.arm.fk(joints), _picking(model.cell, arm, where), atol=1e-6)
+            arms = [{"holding": index == arm, "joints_rad": joints.tolist()} for index in range(2)]
+            state = {"block": {"pose": pose.tolist()}, "arms": arms, "phase": "transfer", "doing": "moving"}
+            np.testing.assert_allclose(page._block(model, state), flat_pose(*wanted), atol=1e-6)
+    assert tried > 30
+
+
+def test_buttons_follow_what_the_session_allows(page, session):
+    state = session.states[len(session.states) // 2]
+    page.show_state(state)
+    assert all(button.disabled for button in (page._start, page._pause, page._send))
+    assert "Watching only" in page._steering.content
+    page.show_state(state, view_control=True, pausing=False)
+    assert (page._start.disabled, page._pause.disabled, page._send.disabled) == (True, False, False)
+    page.show_state(state, view_control=True, pausing=True)
+    assert (page._start.disabled, page._pause.disabled) == (False, True)
+    page.show_state(state, view_control=True, over=True)
+    assert all(button.disabled for button in (page._start, page._pause, page._send))
+
+
+def test_stop_latches_and_says_whether_anybody_obeyed(page, session, tmp_path, monkeypatch):
+    page.show_state(session.states[-1])
+    monkeypatch.setattr("marl_handover.viewer.live.ANSWER_S", 0.0)
+    page.stop()
+    latch = StopLatch(tmp_path / "stop")
+    assert latch.is_set()
+    assert latch.reason() == "STOP pressed in the browser"
+    page.update()
+    assert "CUT THE POWER" in page._stop_note.content
+    latch.obeyed()
+    page.update()
+    assert "has stopped its arms" in page._stop_note.content
+
+
+def test_what_a_session_says_is_text_and_no_page(page, session, tmp_path):
+    evil = "<script>alert(1)</script>"
+    page.show_state(session.states[-1], text=evil, policy=evil, faults={evil: 1}, doing=evil)
+    (tmp_path / EVENTS_FILE).write_text(json.dumps({"t_s": 1.0, "event": "bad_reply", "text": evil}) + "\n")
+    page.update()
+    handles = (page._headline, page._facts, page._log, page._arms, page._plan, page._steering)
+    assert any("&lt;script&gt;" in handle.content for handle in handles)
+    assert not any("<script" in handle.content for handle in handles)
+
+
+def test_the_log_keeps_its_tail(page, session, tmp_path):
+    page.show_state(session.states[-1])
+    (tmp_path / EVENTS_FILE).write_text("".join(f'{{"t_s": {t}, "event": "resumed"}}\n' for t in range(100)))
+    page.update()
+    assert page._log.content.count("resumed") == 30
+    assert page._log.content.index("99.00") < page._log.content.index("70.00"), "the newest first"
+
+
+def test_a_page_opened_for_another_cell_shows_the_session_s(server, session, tmp_path):
+    scene = CellScene(server, build_cell(cell_config("al5a")))
+    page = LivePage(server, scene, Feed(session.folder))
+    page.update()
+    assert page.scene is not scene
+    assert page.scene.model.cell.config.name == "paper"
+
+
+@pytest.mark.parametrize(
+    ("fields", "word"),
+    [
+        ({"doing": "paused"}, "paused"),
+        ({"doing": "moving", "pausing": True}, "pauses before the next"),
+        ({"doing": "stopped", "text": "fire"}, "stop clear=true"),
+        ({"doing": "failed", "text": "no port"}, "no port"),
+        ({"doing": "looking", "quiet_s": 60.0}, "said nothing for 60 s"),
+        ({"doing": "looking", "latch": {"set": True, "reason": "fire"}}, "STOP IS LATCHED"),
+        ({"doing": "waiting: the marker is hidden"}, "hidden"),
+    ],
+)
+def test_headlines(fields, word):
+    state = {"doing": "", "text": "", "over": False, "quiet_s": 0.0, "pausing": False, "arms": [], "phase": ""} | fields
+    assert word in live_words.headline(Reading(state, True, "", 0.0))
+    assert "gone" in live_words.headline(Reading(state, False, "process 1 is gone", 9.0))

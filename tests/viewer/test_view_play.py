@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import math
+import threading
+
+import numpy as np
+import pytest
+from viewer_client import Client
+
+from marl_handover import policies
+from marl_handover.runtime.interactive import InteractiveCell
+from marl_handover.viewer.play import PlayPage
+from marl_handover.viewer.server import address, keep_updating
+from marl_handover.viewer.units import flat
+
+SEEN_S = 30.0
+
+
+@pytest.fixture
+def cell(model):
+    return InteractiveCell(policies.load("exact"), model, seed=3)
+
+
+@pytest.fixture
+def viewer(server, cell):
+    """Somebody who looks at a page that runs eight times as fast as it should."""
+    page = PlayPage(server, cell, policies.load("exact"), policies.adapted, ("exact", "pretrained_b", "nonsense"), 4.0)
+    ended = threading.Event()
+    thread = threading.Thread(target=keep_updating, args=(lambda dt_s: page.update(2 * dt_s), 50.0, ended))
+    thread.start()
+    with Client(address(server)) as viewer:
+        viewer.wait(lambda: len(server.get_clients()) == 1 and "position" in viewer.nodes.get("/goal", {}), SEEN_S)
+        yield viewer
+    ended.set()
+    thread.join()
+
+
+def drag(viewer, name, pose):
+    wxyz, position = flat(pose, 8.0)
+    viewer.drag(name, position, wxyz, "start")
+    viewer.drag(name, position, wxyz)
+    viewer.drag(name, position, wxyz, "end")
+
+
+def at(viewer, name):
+    return 1e3 * np.asarray(viewer.nodes[name]["position"])
+
+
+def near(viewer, name, place):
+    return lambda: np.hypot(*(at(viewer, name)[:2] - place)) < 1e-3
+
+
+def test_a_dragged_goal_is_reached_and_stays_until_somebody_wants_another(viewer, cell):
+    pose = np.array([-120.0, 60.0, 1.0])
+    drag(viewer, "/goal_handle", pose)
+    viewer.wait(near(viewer, "/goal", pose[:2]), SEEN_S)
+    viewer.wait(lambda: "Done: the block is at its goal" in viewer.text(), SEEN_S)
+    np.testing.assert_allclose(at(viewer, "/block")[:2], pose[:2], atol=0.01)
+    assert viewer.panel[viewer.input("next problem by itself")]["value"] is False
+    viewer.set("new problem", True)
+    viewer.wait(lambda: not near(viewer, "/goal", pose[:2])(), SEEN_S)
+
+
+def test_a_goal_dragged_out_of_reach_is_put_where_an_arm_reaches_it(viewer, cell):
+    drag(viewer, "/goal_handle", (0.0, 900.0, 0.0))
+    viewer.wait(lambda: at(viewer, "/goal")[1] > 100 and bool(cell.model.cell.reaches(at(viewer, "/goal")[:2]).any()), SEEN_S)
+    viewer.wait(lambda: "Done" in viewer.text(), SEEN_S)
+
+
+def test_a_dragged_block_lies_where_it_was_dragged(viewer, cell):
+    viewer.set("pause", True)
+    viewer.wait(lambda: "Paused" in viewer.text(), SEEN_S)
+    place = (160.0, 60.0)
+    drag(viewer, "/block_handle", (*place, 0.2))
+    viewer.wait(near(viewer, "/block", place), SEEN_S)
+
+
+def test_stop_freezes_everything_until_it_is_cleared_and_gone_on(viewer, cell):
+    viewer.set("STOP", True)
+    viewer.wait(lambda: "STOPPED" in viewer.text(), SEEN_S)
+    frozen = cell.advance(0.0)
+    goal = at(viewer, "/goal").copy()
+    for label in ("pause", "new problem"):
+        viewer.set(label, True)
+    drag(viewer, "/goal_handle", (0.0, 0.0, 0.0))
+    viewer.wait(lambda: viewer.panel[viewer.input("clear the stop")]["disabled"] is False, SEEN_S)
+    still = cell.advance(1.0)
+    assert still.t_s == frozen.t_s
+    np.testing.assert_array_equal(still.joints_rad, frozen.joints_rad)
+    np.testing.assert_array_equal(at(viewer, "/goal"), goal)
+    viewer.set("clear the stop", True)
+    viewer.wait(lambda: "Paused" in viewer.text(), SEEN_S)
+    viewer.set("go on", True)
+    viewer.wait(lambda: "STOPPED" not in viewer.text() and "Paused" not in viewer.text(), SEEN_S)
+
+
+def test_a_goal_in_numbers_is_taken_up(viewer):
+    viewer.set("x, y [mm], turn [°]", [40.0, 10.0, 90.0])
+    viewer.wait(near(viewer, "/goal", (40.0, 10.0)), SEEN_S)
+    turn = viewer.nodes["/goal"]["wxyz"]
+    assert 2 * math.atan2(turn[3], turn[0]) == pytest.approx(math.pi / 2)
+
+
+def test_another_policy_plays_and_one_that_is_none_is_named(viewer):
+    viewer.set("policy", "pretrained_b")
+    viewer.set("policy", "nonsense")
+    viewer.wait(lambda: "nonsense" in viewer.text(), SEEN_S)
+    viewer.wait(lambda: viewer.panel[viewer.input("policy")]["value"] == "pretrained_b", SEEN_S)
+
+
+def test_solved_problems_are_counted_and_followed_by_others(viewer):
+    viewer.wait(lambda: "| problems solved | 2 of 2 (100%) |" in viewer.text(), 3 * SEEN_S)
+    assert "| transfers ÷ fewest | 1.00 |" in viewer.text()
+
+
+def test_a_viewer_that_sends_nonsense_does_no_harm(viewer, cell):
+    goal = at(viewer, "/goal").copy()
+    for label, value in (("speed", math.nan), ("x, y [mm], turn [°]", [math.inf, 0.0, 0.0]), ("policy", "/somebodys/run")):
+        viewer.set(label, value)
+    viewer.drag("/goal_handle", (math.nan, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    viewer.wait(lambda: "policy = '/somebodys/run' is not known" in viewer.text(), SEEN_S)
+    np.testing.assert_array_equal(at(viewer, "/goal"), goal)
+    viewer.set("speed", 1.0)
+    drag(viewer, "/goal_handle", (-120.0, 60.0, 0.0))
+    viewer.wait(near(viewer, "/goal", (-120.0, 60.0)), SEEN_S)
