@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 class RunCommand(LabConfig):
     """Settings of ``run``."""
 
-    policy: str = "pretrained_b"  # exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
+    policy: str = "pretrained_twin"  # exact, random, greedy, pretrained_a, pretrained_b, pretrained_twin, a run directory or a policy file
     episodes: int = 1  # of a real cell with a terminal: before each but the first somebody lays the block anew and presses Enter
     seed: int = 0  # of the twin's problems
     start: list[float] | None = None  # of the twin's block: x [mm], y [mm], orientation [deg]; null: random

@@ -36,7 +36,7 @@ Floats = NDArray[np.float64]
 class SimulateCommand:
     """Settings of ``simulate``. What is not given is the policy's own, or the default."""
 
-    policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
+    policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, pretrained_twin, a run directory or a policy file
     episodes: int = 1  # played one after the other; each ends at the first verdict
     seed: int = 0  # of the problems
     start: list[float] | None = None  # x [mm], y [mm], orientation [deg]; null: random

@@ -41,7 +41,7 @@ class ViewCommand:
     trace: str = ""  # what evaluate wrote with trace=FILE, or run with log=FILE
     live: str = ""  # the folder of a session that runs with publish=FOLDER
     port: int = 8080  # 0: any that is free
-    policy: str = "exact"  # of play: exact, random, greedy, pretrained_a, pretrained_b, a run directory or a policy file
+    policy: str = "exact"  # of play: exact, random, greedy, pretrained_a, pretrained_b, pretrained_twin, a run directory or a policy file
     seed: int = 0  # of the problems to play
     speed: float = 1.0  # simulated seconds in one second
     cell: CellConfig | None = None  # single keys change the paper cell, or the one that the session's log names

@@ -45,7 +45,7 @@ class AssessmentConfig:
     policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, pretrained_twin, a run directory or a policy file
     backend: str = "kinematic"  # where transfers are executed: kinematic, or in closed loop with planned motions noisy, bullet or twin
     episodes: int = 1000  # random problems
-    seed: int = 0  # of the problems and of execution noise
+    seed: int = 0  # of the problems, and of execution noise but for the twin, whose servos go on as they are
     cell: CellConfig | None = None  # single keys change the paper cell
     task: TaskChanges = field(default_factory=TaskChanges)  # task.noise left out: of noisy, 1 mm and 0.5 deg
     grasp: str | None = None  # of bullet: friction or constraint; null: friction

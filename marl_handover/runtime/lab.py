@@ -132,7 +132,7 @@ def camera_calibration(folder: Path) -> CameraCalibration:
     """The camera's, from the folder of calibrations. Raises :class:`MissingFile` or :class:`CorruptFile`."""
     path = folder / CAMERA_FILE
     if not path.is_file():
-        raise MissingFile("camera calibration", path, "run: marl-handover calibrate what=camera")
+        raise MissingFile("camera calibration", path, "run: marl-handover calibrate what=camera hardware=NAME, with the name you run")
     return CameraCalibration.load(path)
 
 

@@ -27,6 +27,7 @@ Floats = NDArray[np.float64]
 
 VERSION = 2
 FILE = "play.json"
+AGAIN = "run: marl-handover calibrate what=servos hardware=NAME, with the name you run"
 MOST_US = 20.0
 _STILL_RAD = 1e-6
 
@@ -92,12 +93,12 @@ def load_play(folder: Path) -> dict[str, Floats]:
     """Half the dead bands (5,) in us, by arm. Raises :class:`MissingFile`, :class:`CorruptFile` or :class:`InvalidSetting`."""
     path = folder / FILE
     if not path.is_file():
-        raise MissingFile("play of the servos", path, "run: marl-handover calibrate what=servos")
+        raise MissingFile("play of the servos", path, AGAIN)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["version"] != VERSION:
             why = f"it has version {content['version']!r}, this program reads {VERSION}, a band for each joint"
-            raise CorruptFile("play of the servos", path, f"{why}; run: marl-handover calibrate what=servos")
+            raise CorruptFile("play of the servos", path, f"{why}; {AGAIN}")
         found = {arm: np.array([float(content["half_band_us"][arm][joint]) for joint in ARM_JOINTS]) for arm in ARMS}
         for arm, values in found.items():
             for joint, value in zip(ARM_JOINTS, values, strict=True):

@@ -13,14 +13,13 @@ from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
 from marl_handover.files import keep, write_whole
 from marl_handover.hardware.calibration import ArmCalibration, CalibrationProblem
 from marl_handover.hardware.settings import ARMS
+from marl_handover.runtime.play import AGAIN, save_play
 from marl_handover.runtime.play import FILE as PLAY_FILE
-from marl_handover.runtime.play import save_play
 
 SET_FILE = "servos.json"
 """Names the others' content, so that files of two calibrations are told from those of one."""
 
 VERSION = 1
-_AGAIN = "run: marl-handover calibrate what=servos"
 
 
 def arm_file(arm: str) -> str:
@@ -66,18 +65,18 @@ def require_one_set(folder: Path, names: Collection[str] = NAMES) -> None:
     """
     for name in (*names, SET_FILE):
         if not (folder / name).is_file():
-            raise MissingFile("servo calibration", folder / name, _AGAIN)
+            raise MissingFile("servo calibration", folder / name, AGAIN)
     path = folder / SET_FILE
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["version"] != VERSION:
-            raise CorruptFile("servo calibration", path, f"it has version {content['version']!r}, this program reads {VERSION}; {_AGAIN}")
+            raise CorruptFile("servo calibration", path, f"it has version {content['version']!r}, this program reads {VERSION}; {AGAIN}")
         wanted = {name: str(content["sha256"][name]) for name in names}
         others = [name for name in names if _digest(folder / name) != wanted[name]]
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise CorruptFile("servo calibration", path, f"{type(error).__name__}: {error}") from error
     if others:
-        raise CalibrationProblem(str(folder), f"{' and '.join(others)} changed since the others were written; {_AGAIN}")
+        raise CalibrationProblem(str(folder), f"{' and '.join(others)} changed since the others were written; {AGAIN}")
 
 
 def _digest(path: Path) -> str:

@@ -212,6 +212,7 @@ def test_a_hidden_marker_and_a_frozen_camera_are_waited_for(start):
     assert lab.counts[Event.CAMERA_FROZEN] == 1
 
 
+@pytest.mark.slow
 def test_a_block_out_of_sight_after_a_motion_is_not_taken_for_a_fallen_one(start):
     """A hand over it for longer than there is patience: it is waited for once more, and the episode goes on."""
     lab = start()
@@ -222,6 +223,7 @@ def test_a_block_out_of_sight_after_a_motion_is_not_taken_for_a_fallen_one(start
     assert lab.counts[Event.MARKER_HIDDEN] >= 1
 
 
+@pytest.mark.slow
 def test_a_block_that_stays_out_of_sight_ends_the_episode_not_the_session(start):
     lab = start()
     when(lab, lambda: carried_high(lab), lambda: lab.twin.hide(30.0))

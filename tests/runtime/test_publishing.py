@@ -94,6 +94,7 @@ def without_wall_times(path):
     return [{key: value for key, value in row.items() if key != "planning_ms"} for row in rows(path)]
 
 
+@pytest.mark.slow
 def test_killed_viewers_a_lost_folder_and_forged_commands_change_nothing(cell, tmp_path):
     alone = tmp_path / "alone.jsonl"
     assert main(["run", *cell.usual, "seed=3", f"log={alone}"]) == 0
