@@ -30,7 +30,7 @@ class PlotConfig:
     suite: str = ""  # kind=compare: folder of a suite that compare wrote
     figure: str = ""  # kind=compare: one of its figures; all if empty
     scale: str = "log"  # kind=errors: log or linear
-    symmetry_order: int = 1  # of the block in the trace
+    symmetry_order: int | None = None  # of the block in the trace; null: as the file says, or 1
     cell: CellConfig | None = None  # null: the file's own, or paper
     out: str = ""  # .png, .pdf or .svg; learning.png in the run directory, or beside the file; of a whole suite: a folder
 
@@ -45,7 +45,8 @@ def run(config: PlotConfig) -> int:
     from marl_handover.report.files import require_picture, save_figure
 
     require_choice("kind", config.kind, KINDS)
-    require_at_least("symmetry_order", config.symmetry_order, 1)
+    if config.symmetry_order is not None:
+        require_at_least("symmetry_order", config.symmetry_order, 1)
     whole_suite = config.kind == "compare" and not config.figure
     if config.out and not whole_suite:
         require_picture("out", config.out)
@@ -157,10 +158,12 @@ def _transfers(config: PlotConfig, result: dict[str, Any]) -> tuple[Any, Any]:
 
 def _errors(config: PlotConfig) -> tuple[Figure, Path]:
     from marl_handover.report.errors import SCALES, errors_figure
+    from marl_handover.report.traces import symmetry_of
 
     require_choice("scale", config.scale, SCALES)
     path, trace = _traces(config, 1)[0]
-    return errors_figure(trace, config.symmetry_order, config.scale, path.stem), path.with_name(f"{path.stem}_errors.png")
+    order = symmetry_of(trace, config.symmetry_order)
+    return errors_figure(trace, order, config.scale, path.stem), path.with_name(f"{path.stem}_errors.png")
 
 
 def _confusion(config: PlotConfig) -> tuple[Figure, Path]:
@@ -187,13 +190,13 @@ def _rules(config: PlotConfig, trace: Any, epsilon_deg: float = 5.0) -> Any:
     """The rule book of the trace's cell. Raises :class:`InvalidSetting` for a cell in which nobody reaches its problems."""
     from marl_handover.cell import load_cell
     from marl_handover.config import TaskConfig
-    from marl_handover.report.traces import as_seen
+    from marl_handover.report.traces import as_seen, symmetry_of
     from marl_handover.task.rules import Rules
 
     cell = load_cell(config.cell or CellConfig())
     if not (cell.reaches(as_seen(cell, trace.start)).any(-1) & cell.reaches(trace.goal).any(-1)).all():
         raise InvalidSetting("cell", cell.config.name, "the cell of the trace; some of its episodes are out of this one's reach")
-    return Rules(cell, TaskConfig(epsilon_deg=epsilon_deg, symmetry_order=config.symmetry_order))
+    return Rules(cell, TaskConfig(epsilon_deg=epsilon_deg, symmetry_order=symmetry_of(trace, config.symmetry_order)))
 
 
 def _suite_figure(config: PlotConfig) -> tuple[Figure, Path]:

@@ -6,8 +6,8 @@ import contextlib
 import json
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 MODES = ("play", "trace", "live")
 SHIPPED = ("exact", "pretrained_b", "pretrained_a")
 LIVE_HZ = 20.0
+UNUSED: dict[str, tuple[str, ...]] = {"play": (), "trace": ("policy", "seed"), "live": ("policy", "seed", "speed", "task", "motion")}
+"""Keys that mean nothing in a mode."""
 
 Server = Any
 """viser's, which only :mod:`marl_handover.viewer` imports."""
@@ -86,7 +88,7 @@ def serve(config: ViewCommand, ended: threading.Event, ready: Callable[[str], No
         PortTaken, and whatever is wrong with the settings or the files.
     """
     mode = mode_of(config)
-    _check(config)
+    _check(config, mode)
     from marl_handover.viewer.server import address, keep_updating, open_server
 
     with open_server(config.port, "two arms, one block") as server, _PAGES[mode](config, server) as page:
@@ -110,10 +112,22 @@ def mode_of(config: ViewCommand) -> str:
     return mode
 
 
-def _check(config: ViewCommand) -> None:
+def _check(config: ViewCommand, mode: str) -> None:
+    changed = _changed("", {key: getattr(config, key) for key in UNUSED[mode]}, vars(ViewCommand()))
+    for name, value in changed:
+        raise InvalidSetting(name, value, f"left out with {mode}=..., which makes no use of it")
     require_between("port", config.port, 0, 65535)
     require_seed(config.seed)
     config.motion.validate()
+
+
+def _changed(group: str, values: Mapping[str, Any], usual: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Name and value of each key that is not as usual."""
+    for key, value in values.items():
+        if is_dataclass(value):
+            yield from _changed(f"{group}{key}.", vars(value), vars(usual[key]))
+        elif value != usual[key]:
+            yield f"{group}{key}", value
 
 
 @contextlib.contextmanager
@@ -146,6 +160,7 @@ def _trace(config: ViewCommand, server: Server) -> Iterator[Page]:
     require_between("speed", config.speed, *SPEEDS)
     trace = read_trace(Path(config.trace))
     changes: dict[str, Any] = {key: value for key, value in vars(config.task).items() if value is not None}
+    changes["symmetry_order"] = trace.symmetry(config.task.symmetry_order)
     page = TracePage(server, build_cell(_cell(config, trace.cell)), trace, replace(TaskConfig(), **changes), config.motion, config.speed)
     with contextlib.closing(page):
         yield Page(page.update, RATE_HZ)

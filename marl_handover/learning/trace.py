@@ -10,6 +10,15 @@ from marl_handover.learning.rollout import Decision
 from marl_handover.task.rules import Outcome, Rules
 
 
+def judged_by(rules: Rules) -> dict[str, Any]:
+    """What a line says of the rules that its transfer was judged by."""
+    return {
+        "epsilon_rad": rules.epsilon_rad,
+        "symmetry_order": rules.config.symmetry_order,
+        "architecture": rules.config.architecture,
+    }
+
+
 class Trace:
     """An observer of roll-outs. Architecture A's external last transfer becomes a line of its own, with ``"final": true``."""
 
@@ -54,7 +63,7 @@ class Trace:
             "terminated": terminated and not external,
             "truncated": truncated,
             "outcome": None if external or outcome is Outcome.NONE else outcome.name.lower(),
-            "epsilon_rad": self.rules.epsilon_rad,
+            **judged_by(self.rules),
         }
 
     def _external(self, decision: Decision, row: int) -> dict[str, Any] | None:
@@ -79,7 +88,7 @@ class Trace:
             "terminated": True,
             "truncated": False,
             "outcome": Outcome(int(result.outcome[row])).name.lower(),
-            "epsilon_rad": self.rules.epsilon_rad,
+            **judged_by(self.rules),
         }
 
     @staticmethod

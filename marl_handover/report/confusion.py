@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from marl_handover.errors import InvalidSetting
 from marl_handover.report.palette import BLUE, GREY, INK, PAPER
-from marl_handover.report.traces import Trace, foreseen
+from marl_handover.report.traces import Trace, foreseen, symmetry_of
 from marl_handover.task.rules import Outcome, Rules
 
 Integers = NDArray[np.int64]
@@ -34,7 +34,8 @@ _DARK = 0.55
 def meant_figure(trace: Trace, rules: Rules, title: str = "") -> Figure:
     """What exact arms would have made of each episode's last transfer, against how the episode ended."""
     counts = _table(foreseen(trace, rules), trace.outcome, MEANT, ENDINGS)
-    rows = [f"final:\n{_name(outcome)}" for outcome in MEANT[:-1]] + ["a hand-over"]
+    # Exact arms miss a place only by not going there.
+    rows = [*(f"final:\n{_name(outcome)}" for outcome in MEANT[:2]), "refused:\nwrong position", "a hand-over"]
     heading = f"{title}{': ' if title else ''}last transfers of {len(trace.episode):,} episodes"
     return _figure(counts, rows, "expected of the last transfer", "how the episode ended", heading)
 
@@ -43,11 +44,11 @@ def endings_against(first: Trace, second: Trace, names: tuple[str, str]) -> Figu
     """Endings of two policies on the same problems.
 
     Raises:
-        InvalidSetting: if the traces have no problem in common, or the same number means different ones.
+        InvalidSetting: if the traces have no problem in common, or the same number means different ones, or their blocks differ.
     """
     both, in_first, in_second = np.intersect1d(first.episode, second.episode, return_indices=True)
     one, other = first.take(in_first), second.take(in_second)
-    if not len(both) or np.abs(one.goal - other.goal).max() > SAME_GOAL:
+    if not len(both) or np.abs(one.goal - other.goal).max() > SAME_GOAL or symmetry_of(first) != symmetry_of(second):
         raise InvalidSetting("trace", f"[{', '.join(names)}]", "two traces of the same problems, evaluated with one seed and count")
     counts = _table(one.outcome, other.outcome, ENDINGS, ENDINGS)
     kept, lost, gained = counts[0, 0], counts[0, 1:].sum(), counts[1:, 0].sum()

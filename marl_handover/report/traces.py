@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import LoopConfig
-from marl_handover.errors import CorruptFile, MissingFile
+from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
 from marl_handover.runtime.reach import drawn_in
 from marl_handover.task.rules import ROUNDING_RAD, Command, Outcome, Rules
 
@@ -26,7 +26,9 @@ class Trace(NamedTuple):
     """Episodes of a trace (n), in order, each up to its first verdict. Poses (n, 3) in mm and rad.
 
     ``before`` and ``end`` are the object's poses around the last transfer, which ``arm`` made, as a ``final`` one or not. ``outcome`` holds
-    values of :class:`Outcome`, as the trace judged. ``looped``: it is one of the closed loop, where poses are measured ones.
+    values of :class:`Outcome`, as the trace judged. ``looped``: it is one of the closed loop, where poses are measured ones. ``place``
+    (n, 2): where the last transfer was to put the object, in mm. ``external``: it is of architecture A, in which a refusal ends nothing.
+    ``symmetry_order``: of the block, 0 where the file does not say, as those of older versions.
     """
 
     episode: Integers
@@ -40,6 +42,9 @@ class Trace(NamedTuple):
     transfers: Integers
     epsilon_rad: Floats
     looped: NDArray[np.bool_]
+    place: Floats
+    external: NDArray[np.bool_]
+    symmetry_order: Integers
 
     @property
     def solved(self) -> NDArray[np.bool_]:
@@ -83,6 +88,9 @@ def read_trace(path: Path) -> Trace:
         transfers=np.array([count[number] for number in numbers], int),
         epsilon_rad=np.array([end["epsilon_rad"] for end in ends], float),
         looped=np.array([end["looped"] for end in ends], bool),
+        place=np.array([end["place"] for end in ends], float),
+        external=np.array([end["external"] for end in ends], bool),
+        symmetry_order=np.array([end["symmetry_order"] for end in ends], int),
     )
 
 
@@ -104,20 +112,43 @@ def _step(row: dict[str, Any]) -> dict[str, Any]:
     verdict = row["outcome"]
     return {
         "episode": int(row["episode"]),
-        **{key: _pose(row[key]) for key in ("state", "goal", "next_state")},
+        **{key: _numbers(row[key], 3) for key in ("state", "goal", "next_state")},
+        "place": _numbers(row["place"], 2),
         "arm": ARM_LETTERS.index(row["arm"]),
         "final": bool(row["final"]),
         "outcome": 0 if verdict is None else int(Outcome[str(verdict).upper()]),
         "epsilon_rad": float(row["epsilon_rad"]),
         "looped": "attempt" in row,
+        "external": row.get("architecture", "B") == "A",
+        "symmetry_order": _order(row["symmetry_order"]) if "symmetry_order" in row else 0,
     }
 
 
-def _pose(value: Any) -> list[float]:
-    x_mm, y_mm, theta_rad = (float(number) for number in value)
-    if not all(map(math.isfinite, (x_mm, y_mm, theta_rad))):
+def _numbers(value: Any, count: int) -> list[float]:
+    numbers = [float(number) for number in value]
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise ValueError
-    return [x_mm, y_mm, theta_rad]
+    return numbers
+
+
+def _order(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError
+    return value
+
+
+def symmetry_of(trace: Trace, asked: int | None = None) -> int:
+    """Symmetry order of the trace's block: as the file says, else ``asked``, else 1.
+
+    Raises:
+        InvalidSetting: if the file says another one than ``asked``, or several.
+    """
+    said = sorted({int(order) for order in trace.symmetry_order if order > 0})
+    if len(said) > 1:
+        raise InvalidSetting("trace", f"symmetry_order {said}", "of one block")
+    if said and asked is not None and asked != said[0]:
+        raise InvalidSetting("symmetry_order", asked, f"{said[0]}, as the trace says, or left out")
+    return said[0] if said else asked or 1
 
 
 def errors_at_end(trace: Trace, symmetry_order: int) -> tuple[Floats, Floats]:
@@ -134,11 +165,11 @@ def as_seen(cell: Cell, poses: Floats) -> Floats:
 
 
 def foreseen(trace: Trace, rules: Rules) -> Integers:
-    """What exact arms would have made of each episode's last transfer (n,): an :class:`Outcome`; NONE for a hand-over.
+    """What exact arms would have made of each episode's last transfer (n,): an :class:`Outcome`; NONE for a hand-over that can be done.
 
-    ``rules`` are those of architecture B.
+    ``rules`` are those of architecture B. A hand-over that they refuse ends as a wrong position, but in architecture A, where it goes on.
     """
     seen = np.where(trace.looped[:, None], as_seen(rules.cell, trace.before), trace.before)
-    placed, feasible = rules.transfer(seen, trace.goal, Command(trace.final, trace.arm, trace.goal[:, :2]))
+    placed, feasible = rules.transfer(seen, trace.goal, Command(trace.final, trace.arm, trace.place))
     verdict = rules.judge(placed, trace.goal, trace.final, feasible, trace.epsilon_rad + ROUNDING_RAD)
-    return np.where(trace.final, verdict.outcome, int(Outcome.NONE))
+    return np.where(trace.external & ~trace.final, int(Outcome.NONE), verdict.outcome)

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import signal
+import threading
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from marl_handover.hardware.latch import StopLatch
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.perception.calibration import Pixels
 from marl_handover.perception.overlay import read_picture
-from marl_handover.runtime.steering import CONTROL_FILE, Ask
+from marl_handover.runtime.steering import Ask, control_name
 
 STATE_FILE, PICTURE_FILE, EVENTS_FILE = "state.json", "picture.jpg", "events.jsonl"
 FORMAT, VERSION = "marl-handover live", 1
@@ -25,6 +26,8 @@ SILENT_S = 2.0
 """No news for longer than this is said."""
 
 _TAIL_BYTES = 65536
+_LARGEST = 1e15
+"""No number in a folder is larger; infinity is, and what is not a number is not smaller."""
 
 
 class NotSteerable(WorkFailed):
@@ -59,13 +62,13 @@ class Feed:
         self._state: dict[str, Any] | None = None
         self._picture: tuple[int, int] | None = None
         self._events_of, self._offset = "", 0
-        self._number = 0
+        self._number, self._asking = 0, threading.Lock()
 
     def read(self) -> Reading:
         """The newest state."""
         trouble = ""
         try:
-            self._state = _checked(json.loads((self.folder / STATE_FILE).read_bytes()), self.folder / STATE_FILE)
+            self._state = _checked(_loaded((self.folder / STATE_FILE).read_bytes()), self.folder / STATE_FILE)
         except FileNotFoundError:
             trouble = f"{self.folder} holds no session yet" if self._state is None else f"{self.folder} was emptied or taken away"
         except (OSError, ValueError, RecursionError, CorruptFile) as error:
@@ -73,7 +76,8 @@ class Feed:
         state = self._state
         if state is None:
             return Reading(None, False, trouble, 0.0)
-        age_s = max(time.time() - state["time"], 0.0)
+        since_s = time.time() - state["time"]
+        age_s = max(since_s, 0.0)
         if state["over"]:
             return Reading(state, False, "", age_s)
         if _gone(state):
@@ -82,6 +86,8 @@ class Feed:
             )
         if age_s > SILENT_S:
             return Reading(state, False, f"no news for {age_s:.0f} s{'; ' if trouble else ''}{trouble}", age_s)
+        if since_s < -SILENT_S:
+            return Reading(state, False, f"the state is from {-since_s:.0f} s in the future: compare the clocks", age_s)
         return Reading(state, True, trouble, age_s)
 
     def picture(self) -> Pixels | None:
@@ -132,13 +138,14 @@ class Feed:
             raise NotSteerable(reading.problem or "it is over")
         if not reading.state["view_control"]:
             raise NotSteerable("it was started without view_control=true; it can only be stopped")
-        self._number = max(self._number + 1, time.time_ns() // 1_000_000)
-        asked = {"session": reading.state["session"], "number": self._number, "time": time.time(), "command": command, "goal": goal}
+        with self._asking:
+            number = self._number = max(self._number + 1, time.time_ns() // 1_000_000)
+        asked = {"session": reading.state["session"], "number": number, "time": time.time(), "command": command, "goal": goal}
         try:
-            write_whole(self.folder / CONTROL_FILE, json.dumps(asked))
+            write_whole(self.folder / control_name(number), json.dumps(asked))
         except OSError as error:
             raise NotSteerable(f"{error.strerror or error}") from error
-        return self._number
+        return number
 
     def latch(self) -> StopLatch:
         """The stop of this session; before any state was read, the usual one."""
@@ -148,7 +155,7 @@ class Feed:
     def stop(self, reason: str) -> str:
         """Latch the stop: allowed whatever ``view_control`` says. What was done, for people.
 
-        If the latch cannot be written, the session's process is interrupted, which stops every channel too.
+        If the latch cannot be written, the session's process is interrupted, which stops every channel too; but only on its own computer.
         """
         reading = self.read()
         latch = self.latch()
@@ -157,9 +164,9 @@ class Feed:
             return f"stop latched in {latch.path}"
         except OSError as error:
             failed = f"the stop file {latch.path} cannot be written ({error.strerror or error})"
-        if reading.live and reading.state is not None:
-            with contextlib.suppress(OSError):
-                os.kill(int(reading.state["pid"]), signal.SIGINT)
+        if reading.live and reading.state is not None and _here(reading.state) and reading.state["pid"] > 1:  # 1 holds up all others
+            with contextlib.suppress(OSError, OverflowError):
+                os.kill(reading.state["pid"], signal.SIGINT)
                 return f"{failed}; interrupted process {reading.state['pid']} instead"
         return f"{failed}: CUT THE POWER"
 
@@ -171,14 +178,42 @@ def _checked(content: Any, path: Path) -> dict[str, Any]:
         raise CorruptFile("state file", path, f"it has version {content.get('version')}, this package reads {VERSION}")
     kinds = {"session": str, "pid": int, "time": int | float, "over": bool, "view_control": bool, "doing": str, "text": str}
     for name, kind in kinds.items():
-        if not isinstance(content.get(name), kind):
-            raise CorruptFile("state file", path, f"its {name} is {content.get(name)!r}")
+        value = content.get(name)
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            raise CorruptFile("state file", path, f"its {name} is {value!r}")
+    if content["pid"] < 1:  # others mean groups of processes
+        raise CorruptFile("state file", path, f"its pid is {content['pid']}")
+    stop_file = content.get("stop_file", "")
+    if not isinstance(stop_file, str) or "\0" in stop_file:
+        raise CorruptFile("state file", path, f"its stop_file is {stop_file!r}")
     return content
+
+
+def _loaded(content: bytes) -> Any:
+    """JSON without numbers that nobody can reckon with. Raises ValueError and RecursionError."""
+    return json.loads(content, parse_float=_number, parse_constant=_number, parse_int=_integer)
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not abs(value) < _LARGEST:
+        raise ValueError(f"{text[:20]} is not a number of a session")
+    return value
+
+
+def _integer(text: str) -> int:
+    _number(text)
+    return int(text)
+
+
+def _here(state: dict[str, Any]) -> bool:
+    """Whether the session's process is one of this computer."""
+    return bool(state.get("host") == os.uname().nodename)
 
 
 def _gone(state: dict[str, Any]) -> bool:
     """Whether the session's process is known not to run any more."""
-    if state.get("host") != os.uname().nodename:
+    if not _here(state):
         return False
     try:
         os.kill(state["pid"], 0)
@@ -191,7 +226,7 @@ def _gone(state: dict[str, Any]) -> bool:
 
 def _row(line: bytes) -> dict[str, Any]:
     try:
-        row = json.loads(line)
+        row = _loaded(line)
     except (ValueError, RecursionError):
         row = None
     return row if isinstance(row, dict) and "event" in row else {"t_s": None, "event": "a damaged line"}

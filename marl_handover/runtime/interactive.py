@@ -1,7 +1,7 @@
 """The interactive cell: goal or block may be changed at any time, in mid-motion too, and the arms re-plan at once.
 
-A cell of exact, kinematic arms in simulated time, for a person to play with. One thread calls :meth:`InteractiveCell.advance`; wishes may
-come from any thread. What is wished last is done; what was planned for an older wish is dropped.
+A cell of exact, kinematic arms in simulated time, for a person to play with. Wishes may come from any thread, and so may calls of
+:meth:`InteractiveCell.advance`, which take turns. What is wished last is done; what was planned for an older wish is dropped.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class InteractiveCell:
     it. A block dragged to where an arm is, or cannot be kept off, stays where it was.
 
     While paused or stopped, simulated time stands still. A stop is latched: :meth:`resume` does nothing until :meth:`clear`, after
-    which the cell is paused; clearing alone moves nothing.
+    which the cell is paused; clearing alone moves nothing. What is wished before the clear, and was not begun at the stop, is dropped.
 
     Args:
         policy: the supervisor.
@@ -110,30 +110,41 @@ class InteractiveCell:
         planner = MotionPlanner(model, self.motion)
         planner.warm_up()
         self._engine = Engine(Decider(policy, model, self.motion), model, planner, seed)
-        self._lock = threading.Lock()
+        self._lock, self._advancing = threading.Lock(), threading.Lock()
         self._wishes, self._paused, self._stopped = _Wishes(), False, False
+        self.stops = 0
+        """How often it was stopped."""
         self._t_s, self._since = 0.0, math.nan
         self.last_replan_ms = math.nan
         """From the last wish that changed a motion to the first sample of the new one, wall time; nan at first."""
 
-    def set_goal(self, pose: ArrayLike) -> None:
-        """The goal is at ``pose`` (3,): x_mm, y_mm, yaw_rad. Raises :class:`OutOfReach`, :class:`NotFinite` or :class:`InvalidSetting`."""
-        self._wish(goal=self._checked("goal", pose))
+    def set_goal(self, pose: ArrayLike) -> bool:
+        """The goal is at ``pose`` (3,): x_mm, y_mm, yaw_rad.
 
-    def set_block(self, pose: ArrayLike) -> None:
-        """The block lies at ``pose`` (3,), also if a hand holds it now. Raises as :meth:`set_goal`."""
-        self._wish(block=self._checked("block", pose))
+        Returns:
+            Whether it is taken up: not while stopped.
 
-    def set_policy(self, policy: SupervisorPolicy) -> None:
-        """Another supervisor. Raises :class:`InvalidSetting` as the constructor does."""
-        self._wish(decider=Decider(policy, self.model, self.motion))
+        Raises:
+            OutOfReach, NotFinite, InvalidSetting: of the pose.
+        """
+        return self._wish(goal=self._checked("goal", pose))
 
-    def new_problem(self, seed: int | None = None) -> None:
-        """A random block and goal: those of ``seed``, else the next ones. An episode under way is given up, and not counted."""
+    def set_block(self, pose: ArrayLike) -> bool:
+        """The block lies at ``pose`` (3,), also if a hand holds it now. Returns and raises as :meth:`set_goal`."""
+        return self._wish(block=self._checked("block", pose))
+
+    def set_policy(self, policy: SupervisorPolicy) -> bool:
+        """Another supervisor. Returns as :meth:`set_goal`; raises :class:`InvalidSetting` as the constructor does."""
+        return self._wish(decider=Decider(policy, self.model, self.motion))
+
+    def new_problem(self, seed: int | None = None) -> bool:
+        """A random block and goal: those of ``seed``, else the next ones. An episode under way is given up, and not counted.
+
+        Returns as :meth:`set_goal`.
+        """
         if seed is not None:
             require_seed(seed)
-        with self._lock:
-            self._wishes = replace(self._wishes, problem=NEXT if seed is None else seed, goal=None, block=None, since=time.perf_counter())
+        return self._wish(problem=NEXT if seed is None else seed, goal=None, block=None)
 
     def pause(self) -> None:
         """Time stands still."""
@@ -149,6 +160,8 @@ class InteractiveCell:
         """No arm moves any more when this returns, until :meth:`clear` and then :meth:`resume`."""
         with self._lock:
             self._stopped = self._paused = True
+            self._wishes = _Wishes()
+            self.stops += 1
 
     def clear(self) -> None:
         """Take the stop back; the cell is paused then."""
@@ -156,16 +169,18 @@ class InteractiveCell:
             self._stopped = False
 
     def advance(self, dt_s: float) -> Snapshot:
-        """Let ``dt_s`` of simulated time pass; from one thread only. It takes no longer than to decide once and to plan a path or two.
+        """Let ``dt_s`` of simulated time pass. It takes no longer than to decide once and to plan a path or two.
 
         Raises:
             InvalidSetting: time does not go back.
         """
         require_at_least("dt_s", dt_s, 0)
+        with self._advancing:
+            return self._advance(dt_s)
+
+    def _advance(self, dt_s: float) -> Snapshot:
         with self._lock:
-            wishes = _Wishes() if self._stopped else self._wishes
-            if not self._stopped:
-                self._wishes = _Wishes()
+            wishes, self._wishes = self._wishes, _Wishes()
         replanned = not math.isnan(wishes.since)
         if replanned:
             self._take(wishes)
@@ -209,9 +224,11 @@ class InteractiveCell:
     def _idle(self) -> bool:
         return not (self._paused or self._engine.moving or self._engine.ended)
 
-    def _wish(self, **wish: object) -> None:
+    def _wish(self, **wish: object) -> bool:
         with self._lock:
-            self._wishes = replace(self._wishes, since=time.perf_counter(), **wish)  # type: ignore[arg-type]
+            if not self._stopped:
+                self._wishes = replace(self._wishes, since=time.perf_counter(), **wish)  # type: ignore[arg-type]
+            return not self._stopped
 
     def _checked(self, what: str, pose: ArrayLike) -> Floats:
         """A pose (3,) that an arm reaches, its yaw wrapped."""

@@ -47,6 +47,7 @@ class Portrait:
         """Of its own: asking the session's would change what one that draws lots does next."""
         self._edge_mm = loop.settings.edge_mm
         self._about: dict[str, Any] = {"architecture": loop.rules.config.architecture}
+        self._armed = False
         self._foreseen_for: Any = None
         self._plan: list[Foreseen] = []
 
@@ -55,6 +56,7 @@ class Portrait:
         for row in rows:
             if row["event"] == "session":
                 self._about |= {name: value for name, value in row.items() if name not in ("t_s", "event")}
+            self._armed = self._armed or row["event"] == "armed"
             if row["event"] == "motion":
                 self._look_ahead()
             self.digest.take(row)
@@ -70,6 +72,7 @@ class Portrait:
             "text": digest.stopped or digest.text,
             "pausing": self._desk.paused,
             "driver": str(driver.state),
+            "armed": self._armed,
             "arms": self._arms(phase),
             "phase": phase,
             "block": _block(digest.pose, seen),

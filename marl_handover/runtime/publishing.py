@@ -31,7 +31,7 @@ from marl_handover.perception.overlay import annotated, jpeg
 from marl_handover.perception.tracker import Seen
 from marl_handover.runtime.events import Event
 from marl_handover.runtime.feed import EVENTS_FILE, FORMAT, PICTURE_FILE, STATE_FILE, VERSION, Feed
-from marl_handover.runtime.steering import CONTROL_FILE, ControlFile, Desk
+from marl_handover.runtime.steering import ControlFolder, Desk
 
 if TYPE_CHECKING:
     from marl_handover.runtime.loop import ClosedLoop
@@ -53,7 +53,7 @@ class Publisher:
 
     Args:
         folder: where; made if it is missing. Empty: nothing is shown.
-        view_control: whether the control file in it is obeyed.
+        view_control: whether requests that are laid into it are obeyed.
         paused: whether nothing moves before somebody says so.
         log_path: of the session's own log, to be named to readers.
 
@@ -86,7 +86,7 @@ class Publisher:
         self._over = threading.Event()
         self._thread: threading.Thread | None = None
         self._portrait: Portrait | None = None
-        self._control: ControlFile | None = None
+        self._control: ControlFolder | None = None
         self._number = self._pictures = self._picture_frame = 0
         self._answer: dict[str, Any] | None = None
         self._picture_s = self._written_s = -1e9
@@ -122,7 +122,7 @@ class Publisher:
             return None if cell.reaches(goal[:2]).any() else "no arm reaches that goal"
 
         if self._fixed["view_control"]:
-            self._control = ControlFile(self.folder / CONTROL_FILE, str(self._fixed["session"]), unreachable)
+            self._control = ControlFolder(self.folder, str(self._fixed["session"]), unreachable)
         self._portrait = Portrait(loop, backend, self.desk)
         backend.log.show(self._take_row)
         backend.lab.watcher.shown = self._take_picture

@@ -98,6 +98,7 @@ class Session:
             **about,
             cell=asdict(rules.cell.config),
             epsilon_rad=rules.epsilon_rad,
+            symmetry_order=rules.config.symmetry_order,
             position_tolerance_mm=rules.config.position_tolerance_mm,
             parked_rad=parked,
         )

@@ -1,13 +1,15 @@
 """What people at a page may ask of a session: pause, go on, another goal. Wishes only: nothing here makes an arm move.
 
-A :class:`ControlFile` reads them in one thread and leaves them on the :class:`Desk`, where the session's own thread finds them when it
+A :class:`ControlFolder` reads them in one thread and leaves them on the :class:`Desk`, where the session's own thread finds them when it
 is about to begin a transfer.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import re
 import stat
 import threading
 import time
@@ -22,7 +24,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-CONTROL_FILE = "control.json"
+_REQUEST = re.compile(r"control-\d+-\d+\.json")
 
 MAX_AGE_S = 2.0
 """A command older than this is refused: whoever gave it saw another situation."""
@@ -95,34 +97,50 @@ class Desk:
             obey()
 
 
-class ControlFile:
-    """Reads commands from a file that others replace.
+def control_name(number: int) -> str:
+    """The file for a command of this process: of its own, so that none is replaced by a later one. By their names they are in order."""
+    return f"control-{number:016d}-{os.getpid()}.json"
+
+
+class ControlFolder:
+    """Takes commands from a folder that others lay them into, a file each. What was read is removed.
 
     Args:
-        path: of the file.
+        folder: where they lie.
         session: only commands to the session of this name are taken.
         unreachable: says of a goal (3,) why it cannot be, or None.
     """
 
-    def __init__(self, path: Path, session: str, unreachable: Callable[[Floats], str | None]) -> None:
-        self._path, self._session, self._unreachable = path, session, unreachable
+    def __init__(self, folder: Path, session: str, unreachable: Callable[[Floats], str | None]) -> None:
+        self._folder, self._session, self._unreachable = folder, session, unreachable
         self._began_s = time.time()
-        self._known: tuple[int, int] | None = None
+        self._kept: set[str] = set()
         self._number = -1
 
     def poll(self) -> Answer | None:
-        """The answer to a command that is new; None if there is none. Whatever the file holds, this does not raise."""
+        """The answer to the first command that is new; None if there is none. Whatever the folder holds, this does not raise."""
         try:
-            found = os.stat(self._path)
-            mark = (found.st_mtime_ns, found.st_ino)
-            if mark == self._known:
-                return None
-            self._known = mark
+            names = [name for name in os.listdir(self._folder) if _REQUEST.fullmatch(name) and name not in self._kept]
+        except OSError:
+            return None
+        if not names:
+            return None
+        path = self._folder / min(names)
+        answer = self._read(path)
+        with contextlib.suppress(OSError):
+            path.unlink()
+            return answer
+        self._kept.add(path.name)
+        return answer
+
+    def _read(self, path: Path) -> Answer | None:
+        try:
+            found = os.stat(path)
             if not stat.S_ISREG(found.st_mode):  # reading a pipe could take for ever
                 return Answer(-1, "", None, "the control file is no file")
             if found.st_uid != os.getuid():
                 return Answer(-1, "", None, "the control file belongs to somebody else")
-            with self._path.open("rb") as stream:
+            with path.open("rb") as stream:
                 content = json.loads(stream.read(_LARGEST_BYTES))
         except FileNotFoundError:
             return None

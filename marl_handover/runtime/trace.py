@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from marl_handover.cell.symmetry import ARM_LETTERS
+from marl_handover.learning.trace import judged_by
 from marl_handover.runtime.episode import Episode, Transfer
 from marl_handover.task.rules import Outcome, Rules
 
@@ -38,7 +39,7 @@ def transfer_row(transfer: Transfer, rules: Rules) -> dict[str, Any]:
         "terminated": transfer.terminated,
         "truncated": transfer.truncated,
         "outcome": None if transfer.outcome is Outcome.NONE else transfer.outcome.name.lower(),
-        "epsilon_rad": rules.epsilon_rad,
+        **judged_by(rules),
         "attempt": transfer.attempt,
         "refusal": done.refusal and str(done.refusal),
         "detail": done.detail,

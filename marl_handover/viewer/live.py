@@ -22,7 +22,7 @@ from marl_handover.config import BlockConfig, CellConfig
 from marl_handover.errors import HandoverError
 from marl_handover.perception.calibration import flat_pose
 from marl_handover.runtime.feed import Feed, Reading
-from marl_handover.runtime.steering import Ask
+from marl_handover.runtime.steering import MAX_AGE_S, Ask
 from marl_handover.viewer import live_words
 from marl_handover.viewer.scene import CellScene
 
@@ -54,29 +54,49 @@ class LivePage:
         self.server, self.scene, self.feed = server, scene, feed
         self._said: dict[str, str] = {}
         self._events: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
-        self._session = self._trouble = ""
+        self._heard = self._session = self._trouble = ""
         self._stopping: tuple[float, str] | None = None
+        self._asked: tuple[int, str, float] | None = None
         self._held: Floats | None = None
         self._add_controls()
 
     def update(self, dt_s: float = 0.0) -> None:
-        """Show the newest state; to be called at most 20 times a second, from one thread."""
+        """Show the newest state; to be called at most 20 times a second, from one thread. What cannot be shown is said."""
         reading = self.feed.read()
-        if reading.state is not None and reading.state["session"] != self._session:
-            self._begin(reading.state)
-        self._events.extend(self.feed.events())
-        picture = self.feed.picture()
+        failed = ""
         with self.server.atomic():
-            if picture is not None:
-                self._camera.image = picture
-            if reading.state is not None and self.scene is not None:
-                self._show(self.scene, reading.state)
-            self._tell(reading)
+            for part in (self._follow, self._look, self._show_state, self._tell):
+                try:
+                    part(reading)
+                except Exception as error:  # whatever a folder holds, the page with its STOP button has to stay
+                    failed = failed or f"the session's state cannot be shown: {type(error).__name__}: {error}"
+            self._say("failure", self._failure, live_words.note(failed))
+
+    def _follow(self, reading: Reading) -> None:
+        """Another session: what was said of the one before does not hold for it."""
+        state = reading.state
+        if state is not None and state["session"] != self._heard:
+            self._heard, self._trouble = state["session"], ""
+            self._asked = self._stopping = self._held = None
+            self._events.clear()
+        self._events.extend(self.feed.events())
+        if state is not None and state["session"] != self._session:
+            self._begin(state)
+
+    def _look(self, _: Reading) -> None:
+        picture = self.feed.picture()
+        if picture is not None:
+            self._camera.image = picture
+
+    def _show_state(self, reading: Reading) -> None:
+        if reading.state is not None and self.scene is not None:
+            self._show(self.scene, reading.state)
 
     def _add_controls(self) -> None:
         gui = self.server.gui
         gui.add_html(live_words.BIG_RED)
         self._headline = gui.add_html("")
+        self._failure = gui.add_html("")
         stop = gui.add_button("STOP", color="red", hint="stops every servo where it is; cleared only at the cell, by hand")
         self._stop_note = gui.add_html("")
         self._start = gui.add_button("start", disabled=True)
@@ -106,18 +126,17 @@ class LivePage:
         x_mm, y_mm, turn_deg = self._goal.value
         goal = [x_mm, y_mm, math.radians(turn_deg)] if command is Ask.GOAL else None
         try:
-            self.feed.ask(command, goal)
+            self._asked = (self.feed.ask(command, goal), str(command), time.monotonic())
             self._trouble = ""
         except HandoverError as error:
             self._trouble = str(error)
 
     def _begin(self, state: dict[str, Any]) -> None:
-        """Another session: another log, maybe another cell."""
+        """Maybe it has another cell."""
         wanted = _cell_config(state)
         if wanted is None:
             return
-        self._session, self._held, self._stopping = state["session"], None, None
-        self._events.clear()
+        self._session = state["session"]
         if self.scene is not None and self.scene.model.cell.config == wanted:
             return
         self._said.pop("joints", None)
@@ -125,7 +144,8 @@ class LivePage:
             model = build_cell(wanted)
             self.server.scene.reset()
             self.scene = CellScene(self.server, model)
-        except (HandoverError, OSError) as error:
+        except Exception as error:  # of whatever the state says the cell is
+            self.scene = None
             self._trouble = f"the session's cell cannot be shown: {error}"
 
     def _show(self, scene: CellScene, state: dict[str, Any]) -> None:
@@ -173,7 +193,7 @@ class LivePage:
         for handle, usable in ((self._start, steered and waiting), (self._pause, steered and not waiting), (self._send, steered)):
             if handle.disabled == usable:
                 handle.disabled = not usable
-        self._say("steering", self._steering, live_words.note(self._trouble or _steering_words(reading)))
+        self._say("steering", self._steering, live_words.note(self._trouble or self._steering_words(reading)))
         if "episode" not in state:
             return
         label = _camera_label(reading)
@@ -196,22 +216,25 @@ class LivePage:
             return f"{done}; the session is over"
         return f"{done}; no session has answered: if arms move, CUT THE POWER" if time.monotonic() - asked_s > ANSWER_S else done
 
+    def _steering_words(self, reading: Reading) -> str:
+        """What became of what was asked for, here or at another page."""
+        state = reading.state
+        assert state is not None
+        if not reading.live:
+            return ""
+        if not state["view_control"]:
+            return "Watching only: the session was started without view_control=true. STOP works."
+        answer = state.get("control")
+        if self._asked is not None and (not answer or answer["number"] < self._asked[0]):
+            _, command, asked_s = self._asked
+            return f"{command}: asked" if time.monotonic() - asked_s < MAX_AGE_S else f"{command}: the session has not taken it"
+        if answer and answer["refused"]:
+            return f"{answer['command']} was refused: {answer['refused']}"
+        return f"{answer['command']}: done" if answer else ""
+
     def _say(self, key: str, handle: viser.GuiHtmlHandle, text: str) -> None:
         if self._said.get(key) != text:
             self._said[key] = handle.content = text
-
-
-def _steering_words(reading: Reading) -> str:
-    state = reading.state
-    assert state is not None
-    if not reading.live:
-        return ""
-    if not state["view_control"]:
-        return "Watching only: the session was started without view_control=true. STOP works."
-    answer = state.get("control")
-    if answer and answer["refused"]:
-        return f"{answer['command']} was refused: {answer['refused']}"
-    return f"{answer['command']}: done" if answer else ""
 
 
 def _camera_label(reading: Reading) -> str:

@@ -47,7 +47,7 @@ def headline(reading: Reading) -> str:
     if reading.problem:
         return _banner("NO NEWS" if not reading.live else word, reading.problem, ALERT)
     if word in ("stopped", "failed"):
-        return _banner(word.upper(), f"{text}. Arms hold. To allow motion, at the cell: marl-handover stop clear=true", ALERT)
+        return _banner(word.upper(), _broken_off(state), ALERT)
     if state.get("latch", {}).get("set") and not state["over"]:
         return _banner("STOP IS LATCHED", state["latch"]["reason"], ALERT)
     if state["over"]:
@@ -68,7 +68,7 @@ def facts(state: Mapping[str, Any]) -> str:
     totals, episode, faults = state.get("totals"), state.get("episode"), state.get("faults") or {}
     rows = [("session", f"{state.get('hardware', '?')}, policy {state.get('policy', '?')}{', dry run' if state.get('dry_run') else ''}")]
     if totals and episode:
-        rows.append(("episode", f"{episode['number'] + 1}, transfer {episode['transfers'] + 1}"))
+        rows.append(("episode", _progress(episode, ended=bool(state["over"]) or totals["episodes"] > episode["number"])))
         rows.append(("solved", f"{totals['solved']} of {totals['episodes']}; {totals['transfers']} transfers"))
     block = state.get("block") or {}
     if block.get("pose"):
@@ -117,6 +117,25 @@ def note(text: str) -> str:
     return f'<div style="{_SMALL}">{html.escape(text)}</div>' if text else ""
 
 
+def _broken_off(state: Mapping[str, Any]) -> str:
+    """Why, and what that means for the arms and for whoever wants them to move again."""
+    latched = bool(state.get("latch", {}).get("set"))
+    told = (
+        state["text"],
+        "Arms hold" if state.get("armed") else "",
+        "To allow motion, at the cell: marl-handover stop clear=true" if latched else "",
+    )
+    return ". ".join(part for part in told if part)
+
+
+def _progress(episode: Mapping[str, Any], ended: bool) -> str:
+    """Which episode it is, from 1, and how far it is or went."""
+    if episode["number"] < 0:
+        return "none yet"
+    transfers = episode["transfers"]
+    return f"{episode['number'] + 1}, {f'ended; transfers: {transfers}' if ended else f'transfer {transfers + 1}'}"
+
+
 def _motion(state: Mapping[str, Any]) -> str:
     moving = next((arm for arm in state.get("arms", ()) if arm["moving"]), None)
     return "an arm is about to move" if moving is None else f"{moving['name']} arm {DOING.get(state['phase'], 'moves')}"
@@ -126,7 +145,7 @@ def _event(row: Mapping[str, Any]) -> str:
     name = str(row["event"])
     parts = [f"{key} {_value(key, value)}" for key, value in row.items() if key in _SHOWN.get(name, _ALWAYS) and value is not None]
     when = row.get("t_s")
-    line = html.escape(f"{when:8.2f}  " if isinstance(when, int | float) else " " * 10) + html.escape(f"{name}  {', '.join(parts)}")
+    line = html.escape(f"{when:8.2f}  " if _finite(when) else " " * 10) + html.escape(f"{name}  {', '.join(parts)}")
     return f'<b style="color:{ALERT}">{line}</b>' if name in FAULTS else line
 
 
@@ -135,11 +154,15 @@ _SHOWN = {"motion": ("arm",), "transfer": ("arm", "final", "next_state", "refusa
 
 
 def _value(key: str, value: Any) -> str:
-    if key in _NUMBERS and isinstance(value, list) and all(isinstance(item, int | float) for item in value):
+    if key in _NUMBERS and isinstance(value, list) and len(value) in (2, 3) and all(_finite(item) for item in value):
         return _pose(value)
-    if key == "arm" and value in (0, 1):
+    if key == "arm" and type(value) is int and value in (0, 1):
         return ARM_LETTERS[value]
     return f"{value:.1f}" if isinstance(value, float) else str(value)
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def _pose(pose: Sequence[float]) -> str:

@@ -19,7 +19,7 @@ from marl_handover.viewer.handles import PlaneHandle
 from marl_handover.viewer.inputs import by_hand, number, write
 from marl_handover.viewer.reach import within_reach
 from marl_handover.viewer.scene import CellScene
-from marl_handover.viewer.words import decision_words, score_words, state_words
+from marl_handover.viewer.words import decision_words, plain, score_words, state_words
 
 Floats = NDArray[np.float64]
 
@@ -58,12 +58,13 @@ class PlayPage:
         speed: float = 1.0,
     ) -> None:
         self.server, self.cell, self._policy, self._load, self._names = server, cell, policy, load, tuple(names)
+        self._chosen = self._names[0]
         self.scene = CellScene(server, cell.model)
         self.dragged = threading.Event()
         self._goal_handle = PlaneHandle(server, "/goal_handle", 8.0, ["/goal/body"], self.dragged)
         self._block_handle = PlaneHandle(server, "/block_handle", 8.0, ["/block/body"], self.dragged)
         self._said: dict[str, str] = {}
-        self._stopped = False
+        self._stopped, self._stops = False, cell.stops
         self._over_s, self._trouble, self._decision = 0.0, "", ""
         self._lock = threading.Lock()
         self._add_controls(speed)
@@ -98,7 +99,7 @@ class PlayPage:
         stop.on_click(lambda _: self.cell.stop())
         self._clear.on_click(lambda _: self.cell.clear())
         self._pause.on_click(lambda _: self._toggle())
-        new.on_click(lambda _: self.cell.new_problem())
+        new.on_click(lambda _: self._renew())
         self._policy_choice.on_update(self._choose)
         self._numbers.on_update(self._enter)
 
@@ -108,21 +109,26 @@ class PlayPage:
         else:
             self.cell.pause()
 
+    def _renew(self) -> None:
+        self._done(self.cell.new_problem())
+
     def _choose(self, event: viser.GuiEvent[Any]) -> None:
         """Another policy, from a thread of the server's."""
         if not by_hand(event):
             return
         with self._lock:
-            name = str(self._policy_choice.value)
+            name, stops = str(self._policy_choice.value), self.cell.stops
             try:
                 require_choice("policy", name, self._names)
                 policy = self._load(name)
-                self.cell.set_policy(policy)
+                taken = self.cell.stops == stops and self.cell.set_policy(policy)
             except HandoverError as error:
-                self._trouble = str(error)
-                write(self._policy_choice, self._policy.name)
-                return
-            self._trouble, self._policy = "", policy
+                self._trouble, taken = str(error), False
+            if taken:
+                self._policy, self._chosen = policy, name
+            else:
+                write(self._policy_choice, self._chosen)
+            self._done(taken)
 
     def _enter(self, event: viser.GuiEvent[Any]) -> None:
         """A goal in numbers."""
@@ -130,22 +136,29 @@ class PlayPage:
             return
         x_mm, y_mm, turn_deg = self._numbers.value
         pose = np.array([x_mm, y_mm, math.radians(turn_deg)])
-        if np.isfinite(pose).all():
+        if np.isfinite(pose).all() and self._done(self.cell.set_goal(within_reach(self.cell.model.cell, pose))):
             write(self._auto, False)
-            self.cell.set_goal(within_reach(self.cell.model.cell, pose))
+        else:
+            self._said.pop("goal", None)  # the goal as it is takes the place of what was entered
+
+    def _done(self, taken: bool) -> bool:
+        """Whether something was taken up; if so, what went wrong before is of no more interest."""
+        if taken:
+            self._trouble = ""
+        return taken
 
     def _obey(self) -> bool:
-        """Take up what was dragged since the last time, if anything was.
-
-        After a stop nothing is taken up, lest it be done when the stop is cleared.
-        """
-        obeyed = False
+        """Take up what was dragged since the last time, if anything was. After a stop nothing is, lest it be done when that is cleared."""
+        obeyed, stops = False, self.cell.stops
+        lost = self._stopped or stops != self._stops
         for handle, move in ((self._goal_handle, self.cell.set_goal), (self._block_handle, self.cell.set_block)):
             dragged = handle.fetch()
-            if dragged is not None and not self._stopped:
+            if dragged is None or lost:
+                continue
+            if self._done(move(within_reach(self.cell.model.cell, dragged.pose))):
                 obeyed = True
                 write(self._auto, False)
-                move(within_reach(self.cell.model.cell, dragged.pose))
+        self._stops = stops
         return obeyed
 
     def _go_on(self, snapshot: Snapshot, dt_s: float) -> None:
@@ -175,7 +188,7 @@ class PlayPage:
         rules = self._policy.rules
         if snapshot.plan:
             self._decision = decision_words(rules, snapshot.plan, snapshot.goal)
-        self._say("state", self._state, f"{state_words(snapshot)}\n\n{self._trouble or snapshot.message}")
+        self._say("state", self._state, f"{state_words(snapshot)}\n\n{plain(snapshot.message)}\n\n{plain(self._trouble)}")
         self._say("score", self._score, score_words(snapshot))
         self._say("last", self._last, f"Last decision: {self._decision}" if self._decision else "")
         label = "go on" if snapshot.state == "paused" else "pause"

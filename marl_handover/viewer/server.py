@@ -89,7 +89,7 @@ def keep_updating(update: Callable[[float], None], rate_hz: float, ended: thread
         now = time.perf_counter()
         update(min(now - before, LAGGING_S))
         before = now
-        due = max(due + period_s, now + period_s - LAGGING_S)
+        due = min(max(due + period_s, now + period_s - LAGGING_S), now + period_s)
         pause.wait(max(0.0, due - time.perf_counter()))
 
 

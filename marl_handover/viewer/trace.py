@@ -16,7 +16,7 @@ from marl_handover.viewer.inputs import by_hand, number, write
 from marl_handover.viewer.scene import CellScene
 from marl_handover.viewer.trace_file import Moment, Step, Trace
 from marl_handover.viewer.trace_motion import Motion, Motions
-from marl_handover.viewer.words import arm_name, degrees_words, error_words, place_words
+from marl_handover.viewer.words import arm_name, degrees_words, error_words, place_words, plain
 
 SPEEDS = (0.25, 20.0)
 PAUSE_S = 0.6
@@ -29,6 +29,7 @@ RESULTS = {
     "wrong_position": "ended at a **wrong place**",
     "timeout": "ended: **too many transfers**",
 }
+STUCK = "ended: **the policy wanted no arm to move**"
 
 
 class TracePage:
@@ -188,8 +189,8 @@ def moment_words(rules: Rules, trace: Trace, moment: Moment, steps: list[Step]) 
         return "\n\n".join(lines)
     step = steps[moment.done - 1]
     where = "to the goal" if step.final else f"to a hand-over at {place_words(step.place_mm)}"
-    lines.append(f"{arm_name(step.arm)} {where}" + (f": {step.trouble}" if step.trouble else ""))
+    lines.append(f"{arm_name(step.arm)} {where}" + (f": {plain(step.trouble)}" if step.trouble else ""))
     lines.append(f"from the goal: {error_words(rules, step.next_state, step.goal)} ({degrees_words(step.epsilon_rad)} allowed)")
     if step.outcome:
-        lines.append(RESULTS.get(step.outcome, step.outcome))
+        lines.append(STUCK if step.nobody else RESULTS[step.outcome])
     return "\n\n".join(lines)

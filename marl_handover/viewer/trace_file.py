@@ -12,11 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.errors import CorruptFile, MissingFile
+from marl_handover.cell.urdf import ARM_JOINTS
+from marl_handover.envs.cycle_check import Refusal
+from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
+from marl_handover.task.rules import Outcome
 
 Floats = NDArray[np.float64]
 
 WHAT = "trace"
+OUTCOMES = tuple(outcome.name.lower() for outcome in Outcome if outcome is not Outcome.NONE)
 
 
 class Recorded(NamedTuple):
@@ -41,6 +45,12 @@ class Step(NamedTuple):
     trouble: str
     recorded: Recorded | None = None
 
+    @property
+    def nobody(self) -> bool:
+        """Whether it is none: the policy wanted no arm to move, which sessions log as an order to leave the block where it is."""
+        declined = self.outcome == "timeout" and self.trouble.startswith(Refusal.DECLINED)
+        return declined and not self.final and np.array_equal(self.place_mm, self.state[:2])
+
 
 class Moment(NamedTuple):
     """A place in a trace: ``episode``, ``done`` of its ``transfers``, and ``first``, the number of its first step."""
@@ -61,10 +71,13 @@ class Trace:
         starts: (episodes + 1,) number of each episode's first step, and at last the number of steps.
         names: of the episodes, as the file has them.
         cell: settings of the cell, if the file says which.
+        symmetry_order: of the block, if the file says so.
     """
 
-    def __init__(self, steps: list[Step], starts: list[int], names: list[int], cell: dict[str, Any] | None) -> None:
-        self.steps, self.names, self.cell = steps, names, cell
+    def __init__(
+        self, steps: list[Step], starts: list[int], names: list[int], cell: dict[str, Any] | None, symmetry_order: int | None = None
+    ) -> None:
+        self.steps, self.names, self.cell, self.symmetry_order = steps, names, cell, symmetry_order
         self.starts = np.asarray(starts)
         self._first_moments = self.starts + np.arange(len(starts))
 
@@ -84,6 +97,12 @@ class Trace:
         first = int(self.starts[episode])
         return Moment(episode, number - int(self._first_moments[episode]), int(self.starts[episode + 1]) - first, first)
 
+    def symmetry(self, asked: int | None) -> int:
+        """Symmetry order of the block: as the file says, else ``asked``, else 1. Raises :class:`InvalidSetting` if they differ."""
+        if asked is not None and self.symmetry_order not in (None, asked):
+            raise InvalidSetting("task.symmetry_order", asked, f"{self.symmetry_order}, as the trace says, or left out")
+        return self.symmetry_order or asked or 1
+
     def start_of(self, episode: int) -> int:
         """Number of an episode's first moment."""
         return int(self._first_moments[episode])
@@ -100,12 +119,13 @@ def read_trace(path: Path) -> Trace:
     steps: list[Step] = []
     starts: list[int] = []
     names: list[int] = []
-    cell, session = None, _Session()
+    cell, order, session = None, None, _Session()
     for number, row in _rows(path):
         try:
             name = session.take(row) if "event" in row else int(row["episode"])
             if "event" in row and row["event"] == "session":
                 cell = dict(row["cell"])
+            order = _order(row, order)
             if "event" in row and row["event"] != "transfer":
                 continue
             step = _step(row, session.recorded())
@@ -117,7 +137,7 @@ def read_trace(path: Path) -> Trace:
         steps.append(step)
     if not steps:
         raise CorruptFile(WHAT, path, "it holds no transfer")
-    return Trace(steps, [*starts, len(steps)], names, cell)
+    return Trace(steps, [*starts, len(steps)], names, cell, order)
 
 
 class _Session:
@@ -125,7 +145,7 @@ class _Session:
 
     def __init__(self) -> None:
         self.episode = -1
-        self._sent: list[tuple[float, Any, Any]] = []
+        self._sent: list[tuple[float, Floats, Floats]] = []
 
     def take(self, row: dict[str, Any]) -> int:
         """Note a line; the number of the episode."""
@@ -134,7 +154,11 @@ class _Session:
             self.episode += 1
             self._sent = []
         if event == "state":
-            self._sent.append((float(row["t_s"]), row["joints_rad"], row["gripper_mm"]))
+            arms = len(ARM_LETTERS)
+            t_s = float(_numbers(row["t_s"], ()))
+            if self._sent and t_s < self._sent[-1][0]:
+                raise ValueError(f"t_s = {t_s} goes back")
+            self._sent.append((t_s, _numbers(row["joints_rad"], (arms, len(ARM_JOINTS))), _numbers(row["gripper_mm"], (arms,))))
         return self.episode
 
     def recorded(self) -> Recorded | None:
@@ -142,10 +166,7 @@ class _Session:
         sent, self._sent = self._sent, []
         if len(sent) < 2:
             return None
-        t_s = np.array([row[0] for row in sent])
-        joints, gripper = (_numbers([row[index] for row in sent], None) for index in (1, 2))
-        if joints.ndim != 3 or gripper.shape != joints.shape[:2]:
-            raise ValueError("joints_rad and gripper_mm of its state lines do not fit")
+        t_s, joints, gripper = (np.array(column) for column in zip(*sent, strict=True))
         return Recorded(t_s - t_s[0], joints, gripper)
 
 
@@ -169,8 +190,8 @@ def _rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 def _step(row: dict[str, Any], recorded: Recorded | None) -> Step:
     state, goal, next_state = (_numbers(row[key], (3,)) for key in ("state", "goal", "next_state"))
     outcome = row["outcome"]
-    if outcome is not None and not isinstance(outcome, str):
-        raise TypeError("outcome is neither a name nor null")
+    if outcome is not None and outcome not in OUTCOMES:
+        raise ValueError(f"outcome is neither null nor one of {', '.join(OUTCOMES)}")
     if not isinstance(row["final"], bool):
         raise TypeError("final is neither true nor false")
     trouble = " ".join(str(row[key]) for key in ("refusal", "detail") if row.get(key))
@@ -183,10 +204,20 @@ def _step(row: dict[str, Any], recorded: Recorded | None) -> Step:
     return Step(state, goal, arm, row["final"], place, next_state, outcome or "", epsilon_rad, trouble, recorded)
 
 
-def _numbers(value: Any, shape: tuple[int, ...] | None) -> Floats:
+def _order(row: dict[str, Any], before: int | None) -> int | None:
+    """The symmetry order that a line says; that of the lines ``before`` if it says none."""
+    order = row.get("symmetry_order", before)
+    if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1):
+        raise ValueError("symmetry_order is no number from 1")
+    if before not in (None, order):
+        raise ValueError(f"symmetry_order was {before} before")
+    return order
+
+
+def _numbers(value: Any, shape: tuple[int, ...]) -> Floats:
     array = np.asarray(value, dtype=float)
-    if shape is not None and array.shape != shape:
-        raise ValueError(f"{value!r} is not {shape[0]} numbers")
+    if array.shape != shape:
+        raise ValueError(f"{value!r} is not {' x '.join(map(str, shape)) or 'a'} number{'s' * bool(shape)}")
     if not np.isfinite(array).all():
         raise ValueError(f"{value!r} is not finite")
     return array

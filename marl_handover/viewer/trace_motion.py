@@ -86,10 +86,10 @@ class Motions:
         return joints
 
     def _make(self, step: Step) -> Motion:
-        if step.recorded is not None:
-            return self._as_recorded(step, step.recorded)
-        if not step.trouble:
-            with suppress(HandoverError):  # a place that exact arms do not reach
+        with suppress(HandoverError, ArithmeticError, LookupError, ValueError):  # a place that exact arms do not reach, another cell's arms
+            if step.recorded is not None:
+                return self._as_recorded(step, step.recorded)
+            if not step.trouble:
                 return self._planned(step)
         return self._straight(step)
 

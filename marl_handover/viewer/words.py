@@ -34,6 +34,14 @@ STATES = {
     "stuck": "Stuck: the policy knows no way to the goal.",
 }
 
+_MARKUP = frozenset("<>&[]*_`~|\\#!+-.)")
+"""Has a meaning in Markdown or HTML, the last ones after a number that begins a line."""
+
+
+def plain(text: str) -> str:
+    """``text`` on one line, as Markdown that shows it as it is: what comes from files and viewers may be a script or a picture."""
+    return " ".join("".join(f"&#{ord(sign)};" if sign in _MARKUP else sign for sign in text).split())
+
 
 def arm_name(arm: int) -> str:
     """Of an index."""

@@ -45,7 +45,7 @@ def evaluation(tmp_path):
         {"episode": 0, "state": [0, 0, 0.3], "goal": [150, 60, 0.0], "outcome": "success", "arm": "L", "next_state": [150, 60, 0.02]},
         {"episode": 1, "state": [-120, -60, 0], "goal": [150, 60, 1.5], "outcome": "timeout", "arm": "R", "next_state": [0, 0, 0.3]},
     ]
-    rows = [{**row, "final": row["outcome"] == "success", "epsilon_rad": 0.087} for row in rows]
+    rows = [{**row, "place": row["next_state"][:2], "final": row["outcome"] == "success", "epsilon_rad": 0.087} for row in rows]
     (tmp_path / "evaluation.json").write_text(json.dumps(result))
     (tmp_path / "trace.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return tmp_path / "evaluation.json", tmp_path / "trace.jsonl"
@@ -129,6 +129,25 @@ def test_errors_and_confusion_of_a_trace(evaluation, tmp_path, capsys):
     trace.write_text(trace.read_text().replace("150, 60", "-300, 200"))
     assert cli.main(["plot", "kind=confusion", f"trace={trace}"]) == 2
     assert "must be the cell of the trace" in capsys.readouterr().err
+
+
+def test_errors_are_told_by_the_symmetry_that_the_trace_says(tmp_path, capsys):
+    trace, picture = tmp_path / "trace.jsonl", tmp_path / "errors.png"
+    done = ["evaluate", "policy=exact", "episodes=20", "task.symmetry_order=4", f"trace={trace}", "progress=false"]
+    assert cli.main(done) == 0
+    assert cli.main(["plot", "kind=errors", f"trace={trace}", f"out={picture}"]) == 0
+    said = matplotlib.image.imread(picture)
+    lines = [json.loads(line) for line in trace.read_text().splitlines()]
+    # An old file says nothing: then the setting counts.
+    trace.write_text("".join(json.dumps({key: value for key, value in row.items() if key != "symmetry_order"}) + "\n" for row in lines))
+    for setting, same in ((["symmetry_order=4"], True), ([], False)):
+        assert cli.main(["plot", "kind=errors", f"trace={trace}", f"out={picture}", *setting]) == 0
+        assert np.array_equal(matplotlib.image.imread(picture), said) is same
+    trace.write_text("".join(json.dumps(row) + "\n" for row in lines))
+    for kind in ("errors", "confusion"):
+        capsys.readouterr()
+        assert cli.main(["plot", f"kind={kind}", f"trace={trace}", f"out={picture}", "symmetry_order=2"]) == 2
+        assert "symmetry_order = 2: must be 4, as the trace says" in capsys.readouterr().err
 
 
 def test_motions_as_plan_drew_them(tmp_path, capsys):

@@ -1,14 +1,21 @@
 """``simulate``: an episode is played, printed and filmed; bad input is one clear error."""
 
+import contextlib
+import itertools
+import math
+import re
 import subprocess
 import sys
 
 import imageio.v2 as imageio
+import numpy as np
 import pytest
 
 from marl_handover.commands.simulate import ALIASES, GROUPS, SCHEMA, run
 from marl_handover.compose import compose
-from marl_handover.errors import HandoverError, MissingFile
+from marl_handover.errors import HandoverError, MissingFile, WorkFailed
+from marl_handover.simulation import film
+from marl_handover.simulation.backend import BulletBackend
 
 
 def simulate(*arguments):
@@ -76,3 +83,54 @@ def test_an_error_is_one_line(argument, status, says):
     assert done.stderr.count("\n") == 1
     assert says in done.stderr
     assert "pybullet" not in done.stdout
+
+
+@pytest.fixture
+def said(monkeypatch):
+    """What is said below each picture that is drawn, and where the block is then: pairs, in order."""
+    pairs, draw, render = [], film.captioned, BulletBackend.render
+    poses = []
+
+    def rendered(backend):
+        poses.append(backend.cell.object_pose())
+        return render(backend)
+
+    def drawn(picture, caption, size):
+        pairs.append((caption, poses[-1]))
+        return draw(picture, caption, size)
+
+    monkeypatch.setattr(BulletBackend, "render", rendered)
+    monkeypatch.setattr(film, "captioned", drawn)
+    return pairs
+
+
+@pytest.mark.parametrize(("settings", "outcome"), [(["task.symmetry_order=2"], "success"), (["max_steps=1"], "timeout")])
+def test_a_film_says_what_happens(tmp_path, capsys, said, settings, outcome):
+    goal, order = np.array([60.0, 0.0, math.radians(-150)]), 2 if outcome == "success" else 1
+    problem = ["start=[-120,60,0]", "goal=[60,0,-150]", "grasp=constraint", "episodes=2", "progress=false", *settings]
+    with contextlib.nullcontext() if outcome == "success" else pytest.raises(WorkFailed):
+        simulate(*problem, f"video={tmp_path / 'a.gif'}", "fps=2", "size=[64,36]")
+    # As it is printed: for each episode its transfers, as arm and place, then how it ended.
+    printed = capsys.readouterr().out
+    transfers = re.findall(r"^  ([LR]) to \((-?[\d.]+) mm, (-?[\d.]+) mm\)", printed, re.MULTILINE)
+    ends = re.findall(r"^(\w+) after (\d+) transfers", printed, re.MULTILINE)
+    assert {end[0] for end in ends} == {outcome}
+    begins = [number for number, (caption, _) in enumerate(said) if caption.arm < 0]
+    assert len(begins) == len(ends) == 2
+    expected = []
+    for _, count in ends:
+        deeds, transfers = transfers[: int(count)], transfers[int(count) :]
+        expected.append((0, -1, False))
+        for number, (arm, *place) in enumerate(deeds, start=1):
+            expected.append((number, "LR".index(arm), np.allclose(np.array(place, float), goal[:2], atol=0.1)))
+    told = [(caption.transfer, caption.arm, caption.final) for caption, _ in said]
+    assert [deed for deed, _ in itertools.groupby(told)] == expected
+    last = {begins[1] - 1, len(said) - 1}
+    for number, (caption, pose) in enumerate(said):
+        assert caption.outcome == (outcome if number in last else "")
+        assert caption.away_mm == pytest.approx(math.hypot(*(pose[:2] - goal[:2])))
+        assert abs(caption.turned_rad) <= math.pi / order + 1e-9
+        turned_rad = pose[2] - goal[2]
+        assert math.remainder(caption.turned_rad - turned_rad, 2 * math.pi / order) == pytest.approx(0, abs=1e-6)  # goals are float32
+    if outcome == "success":
+        assert max(said[number][0].away_mm for number in last) < 5 < said[0][0].away_mm

@@ -14,8 +14,9 @@ import pytest
 pytest.importorskip("viser", reason="the view extra is not installed")
 
 from marl_handover import cli
-from marl_handover.commands.view import ViewCommand, mode_of
+from marl_handover.commands.view import ViewCommand, _trace, mode_of
 from marl_handover.errors import HandoverError
+from marl_handover.viewer.server import open_server
 
 
 @pytest.mark.parametrize(
@@ -61,6 +62,13 @@ def test_modes_that_do_not_fit_what_is_given_are_refused(settings, words):
         (["live=/nowhere"], "not found"),
         (["motion.grasp_s=0"], "motion.grasp_s"),
         (["policy=pretrained_a", "architecture=B"], "architecture"),
+        (["trace=/nowhere/t.jsonl", "policy=nonsense"], "policy"),
+        (["trace=/nowhere/t.jsonl", "seed=4"], "seed"),
+        (["live=/nowhere", "policy=pretrained_b"], "policy"),
+        (["live=/nowhere", "seed=4"], "seed"),
+        (["live=/nowhere", "speed=2"], "speed"),
+        (["live=/nowhere", "epsilon_deg=3"], "task.epsilon_deg"),
+        (["live=/nowhere", "motion.grasp_s=0.7"], "motion.grasp_s"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, words, capsys):
@@ -81,6 +89,17 @@ def test_a_trace_is_not_played_faster_or_slower_than_its_slider_goes(tmp_path, c
     (tmp_path / "t.jsonl").write_text("{}\n")
     assert cli.main(["view", "port=0", "speed=21", f"trace={tmp_path / 't.jsonl'}"]) == 2
     assert "speed" in capsys.readouterr().err
+
+
+def test_a_trace_is_told_by_the_symmetry_that_it_says(tmp_path, capsys):
+    path = tmp_path / "t.jsonl"
+    done = ["evaluate", "policy=exact", "episodes=2", "task.symmetry_order=4", f"trace={path}", "progress=false"]
+    assert cli.main(done) == 0
+    with open_server(0, "test") as server, _trace(ViewCommand(trace=str(path)), server) as page:
+        page.update(0.0)
+        assert page.update.__self__.rules.config.symmetry_order == 4
+    assert cli.main(["view", "port=0", f"trace={path}", "task.symmetry_order=2"]) == 2
+    assert "task.symmetry_order = 2: must be 4, as the trace says" in capsys.readouterr().err
 
 
 def test_a_port_that_is_taken_is_one_line_with_the_way_out(capsys):

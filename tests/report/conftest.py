@@ -52,7 +52,7 @@ def write_trace(tmp_path):
     def write(*steps, name="trace.jsonl"):
         plain = {
             "episode": 0, "state": [-120.0, -60.0, 0.0], "goal": [150.0, 60.0, 1.0], "arm": "R", "final": False,
-            "next_state": [0.0, 0.0, 0.5], "outcome": None, "epsilon_rad": 0.0873,
+            "place": [0.0, 0.0], "next_state": [0.0, 0.0, 0.5], "outcome": None, "epsilon_rad": 0.0873,
         }  # fmt: skip
         (tmp_path / name).write_text("".join(json.dumps(plain | step) + "\n" for step in steps))
         return tmp_path / name

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from marl_handover.cell import load_cell
-from marl_handover.config import TaskConfig
+from marl_handover.config import TaskChanges, TaskConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.report.confusion import endings_against, meant_figure
 from marl_handover.report.traces import read_trace
 from marl_handover.runtime.assessment import AssessmentConfig, assess
-from marl_handover.task.rules import Rules
+from marl_handover.task.rules import Outcome, Rules
 
 COUNT = 90
 
@@ -35,14 +35,31 @@ def traces(tmp_path_factory):
 
 
 @pytest.mark.parametrize("policy", ["exact", "greedy", "random"])
-def test_finals_of_exact_arms_end_as_expected(traces, policy, assert_tidy):
+def test_exact_arms_do_what_is_expected_of_them(traces, policy, assert_tidy):
     trace, outcomes = traces[policy]
     figure = meant_figure(trace, Rules(load_cell("paper"), TaskConfig()), policy)
     assert_tidy(figure)
     counts = cells(figure)
     assert counts.sum() == COUNT
     assert counts.sum(0).tolist() == list(outcomes.values())
-    assert np.count_nonzero(counts[:3] - np.diag(np.diag(counts))[:3]) == 0
+    assert np.count_nonzero(counts - np.diag(np.diag(counts))) == 0
+
+
+def test_refused_hand_overs_are_wrong_decisions(traces):
+    trace, _ = traces["random"]
+    refused = ~trace.final & (trace.outcome == Outcome.WRONG_POSITION)
+    assert refused.sum() > 5  # else the law above says nothing of them
+    counts = cells(meant_figure(trace, Rules(load_cell("paper"), TaskConfig())))
+    assert counts[2, 2] == (trace.outcome == Outcome.WRONG_POSITION).sum()
+
+
+def test_in_architecture_a_a_refused_hand_over_goes_on(tmp_path):
+    trace, outcomes = trace_of(tmp_path, "random", task=TaskChanges(architecture="A", max_steps=2))
+    counts = cells(meant_figure(trace, Rules(load_cell("paper"), TaskConfig())))
+    refused = (trace.before == trace.end).all(-1) & ~trace.final
+    assert refused.sum() > 5
+    assert counts.sum(0).tolist() == list(outcomes.values())
+    assert np.count_nonzero(counts - np.diag(np.diag(counts))) == 0
 
 
 def test_noise_leaves_the_diagonal(tmp_path):
@@ -70,6 +87,8 @@ def test_other_problems_are_refused(traces, tmp_path):
     other, _ = trace_of(tmp_path, "exact", seed=1)
     with pytest.raises(InvalidSetting, match="two traces of the same problems"):
         endings_against(exact, other, ("a", "b"))
+    with pytest.raises(InvalidSetting, match="same problems"):
+        endings_against(exact, exact._replace(symmetry_order=np.full(COUNT, 4)), ("a", "b"))
     nothing = exact.take(np.zeros(0, int))
     with pytest.raises(InvalidSetting, match="same problems"):
         endings_against(exact, nothing, ("a", "b"))

@@ -22,7 +22,8 @@ def made(turned_deg, away_mm, outcome):
     end = np.stack([away_mm, np.zeros(count), np.radians(turned_deg)], -1)
     none, arm = np.zeros(count, int), np.zeros(count, bool)
     names = np.array([int(Outcome[name.upper()]) for name in outcome])
-    return Trace(np.arange(count), goal, goal, goal, end, none, arm, names, none, np.full(count, np.radians(EPSILON_DEG)), arm)
+    epsilon = np.full(count, np.radians(EPSILON_DEG))
+    return Trace(np.arange(count), goal, goal, goal, end, none, arm, names, none, epsilon, arm, goal[:, :2], arm, none)
 
 
 def bars(axes):

@@ -18,7 +18,7 @@ from marl_handover.hardware.latch import StopLatch
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.perception.overlay import jpeg
 from marl_handover.runtime.feed import EVENTS_FILE, FORMAT, PICTURE_FILE, SILENT_S, STATE_FILE, VERSION, Feed, NotSteerable
-from marl_handover.runtime.steering import CONTROL_FILE, ControlFile
+from marl_handover.runtime.steering import ControlFolder
 
 
 def state(**fields):
@@ -65,6 +65,16 @@ def test_nothing_there_is_said(tmp_path):
         (state(version=99), "version 99"),
         (state(pid="1"), "its pid"),
         (state(time=None), "its time"),
+        (state(pid=-1), "its pid"),
+        (state(pid=0), "its pid"),
+        (state(pid=True), "its pid"),
+        (state(time=True), "its time"),
+        (state(time=float("nan")), "cannot be read"),
+        (state(time=10**400), "cannot be read"),
+        (json.dumps(state(time=0)).replace('"time": 0', '"time": 1e400'), "cannot be read"),
+        (state(block={"pose": [float("inf"), 0, 0]}), "cannot be read"),
+        (state(stop_file=["a"]), "its stop_file"),
+        (state(stop_file="a\0b"), "its stop_file"),
     ],
 )
 def test_a_damaged_state_is_said_and_the_last_good_one_kept(tmp_path, content, word):
@@ -100,6 +110,15 @@ def test_silence_and_an_emptied_folder_are_said(tmp_path):
     assert "no news for 7 s" in reading.problem
     (tmp_path / STATE_FILE).unlink()
     assert "emptied or taken away" in feed.read().problem
+    put(tmp_path, state(time=time.time() + SILENT_S + 60))
+    reading = feed.read()
+    assert not reading.live
+    assert "compare the clocks" in reading.problem
+
+
+def test_an_event_with_a_number_that_is_none_is_a_damaged_line(tmp_path):
+    (tmp_path / EVENTS_FILE).write_text('{"t_s": NaN, "event": "a"}\n{"t_s": 1e999, "event": "b"}\n{"t_s": 1, "event": "c"}\n')
+    assert [row["event"] for row in Feed(tmp_path).events()] == ["a damaged line", "a damaged line", "c"]
 
 
 def test_a_process_that_died_is_said(tmp_path):
@@ -164,14 +183,19 @@ def test_a_session_is_asked_only_if_it_takes_wishes(tmp_path):
     put(tmp_path, state())
     with pytest.raises(NotSteerable, match="view_control"):
         feed.ask("pause")
-    assert not (tmp_path / CONTROL_FILE).exists()
+    assert [path.name for path in tmp_path.iterdir()] == [STATE_FILE]
     put(tmp_path, state(view_control=True))
     with pytest.raises(InvalidSetting, match="start, pause"):
         feed.ask("park")
-    control = ControlFile(tmp_path / CONTROL_FILE, "abc", lambda goal: None)
+    control = ControlFolder(tmp_path, "abc", lambda goal: None)
     for command, goal in (("pause", None), ("goal", [1.0, 2.0, 3.0])):
         number = feed.ask(command, goal)
         assert control.poll() == (number, command, goal, None)
+    asked = [("goal", [1.0, 2.0, 3.0]), ("start", None)]
+    numbers = [feed.ask(*wish) for wish in asked]
+    taken = [control.poll() for _ in asked]
+    assert [answer.command for answer in taken] == ["goal", "start"], "none has replaced another"
+    assert [answer.number for answer in taken] == numbers
     put(tmp_path, state(view_control=True, over=True))
     with pytest.raises(NotSteerable, match="over"):
         feed.ask("pause")
@@ -196,3 +220,14 @@ def test_a_latch_that_cannot_be_written_interrupts_the_session(tmp_path):
     assert f"interrupted process {process.pid}" in feed.stop("page")
     assert process.communicate(timeout=30)[0] == "halted\n"
     assert "CUT THE POWER" in feed.stop("page"), "nobody is left to be interrupted"
+
+
+@pytest.mark.parametrize("where", [{"host": "another-computer"}, {"pid": 1}, {"pid": -1}])
+def test_nobody_is_interrupted_who_is_not_surely_the_session(tmp_path, monkeypatch, where):
+    signals = []
+    monkeypatch.setattr("marl_handover.runtime.feed.os.kill", lambda pid, number: signals.append(number) if number else None)
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("marl_handover.runtime.feed.HardwareConfig.stop_path", lambda _: tmp_path / "file" / "stop")
+    put(tmp_path, state(stop_file=str(tmp_path / "file" / "stop")) | where)
+    assert "CUT THE POWER" in Feed(tmp_path).stop("page")
+    assert signals == []

@@ -116,6 +116,7 @@ def test_a_transfer_through_bytes_and_pixels_is_exact_to_some_mm(start):
     rows = lines(lab.log)
     kinds = [row["event"] for row in rows]
     assert kinds[:5] == ["session", "episode", "armed", "seen", "goal"]
+    assert [row["symmetry_order"] for row in rows if row["event"] in ("session", "transfer")] == [1, 1]
     assert kinds[-2:] == ["transfer", "ended"]
     states = [row for row in rows if row["event"] == "state"]
     assert len(states) > 20

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import threading
 
 import numpy as np
@@ -16,6 +17,8 @@ from interactive_storm import (
     until,
 )
 
+from marl_handover import policies
+
 
 @pytest.fixture
 def cell(model):
@@ -27,8 +30,7 @@ def test_a_stop_freezes_everything_until_it_is_cleared(cell):
     cell.stop()
     frozen = cell.advance(DT_S)
     cell.resume()
-    cell.set_goal(place(cell, 190.0, 0.0))
-    cell.set_block(place(cell, 190.0, 0.0, arm=1))
+    assert not cell.set_goal(place(cell, 190.0, 0.0))
     for _ in range(20):
         later = cell.advance(DT_S)
         assert later.state == "stopped"
@@ -40,8 +42,34 @@ def test_a_stop_freezes_everything_until_it_is_cleared(cell):
     cell.resume()
     later = cell.advance(DT_S)
     assert later.t_s > frozen.t_s
-    assert np.allclose(later.goal, place(cell, 190.0, 0.0))
+    assert np.array_equal(later.goal, frozen.goal)
     assert settle(cell)[-1].state == "done"
+
+
+WISHES = {
+    "goal": lambda cell: cell.set_goal(place(cell, 190.0, 0.0)),
+    "block": lambda cell: cell.set_block(place(cell, 190.0, 0.0, arm=1)),
+    "problem": lambda cell: cell.new_problem(),
+    "policy": lambda cell: cell.set_policy(policies.load("random")),
+}
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["before the stop", "after it"])
+@pytest.mark.parametrize("wish", WISHES.values(), ids=WISHES)
+def test_nothing_asked_for_before_a_stop_is_cleared_is_done_after_it(cell, wish, late):
+    until(cell, "approach", steps=5)
+    frozen = cell.advance(0.0)
+    decider = cell._engine.decider
+    if not late:
+        assert wish(cell)
+    cell.stop()
+    assert not wish(cell)
+    cell.clear()
+    later = cell.advance(DT_S)
+    assert later.state == "paused"
+    assert all(np.array_equal(getattr(later, name), getattr(frozen, name)) for name in ("joints_rad", "T_world_block", "goal", "message"))
+    assert cell._engine.decider is decider
+    assert wish(cell)
 
 
 def test_while_paused_time_stands_still_but_changes_are_taken_up(cell):
@@ -57,6 +85,30 @@ def test_while_paused_time_stands_still_but_changes_are_taken_up(cell):
     cell.advance(DT_S)
     assert math.isnan(cell.last_replan_ms)
     assert settle(cell)[-1].state == "done"
+
+
+def test_threads_that_advance_it_take_turns(cell):
+    """A thread that looks on while another one plays; switched between as often as can be."""
+    errors, until_s, usual = [], 120.0, sys.getswitchinterval()
+
+    def go():
+        try:
+            while (seen := cell.advance(DT_S)).t_s < until_s:
+                if seen.state in ("done", "stuck"):
+                    cell.new_problem()
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=go) for _ in range(2)]
+    sys.setswitchinterval(1e-6)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(usual)
+    assert errors == []
 
 
 def test_threads_may_change_everything_at_any_time(cell):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -13,9 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marl_handover.runtime.steering import CONTROL_FILE, MAX_AGE_S, Ask, ControlFile, Desk
+from marl_handover.runtime.steering import MAX_AGE_S, Ask, ControlFolder, Desk, control_name
 
 SESSION = "abc"
+LAID = itertools.count()
 
 
 def far(goal):
@@ -24,7 +26,7 @@ def far(goal):
 
 @pytest.fixture
 def control(tmp_path):
-    return ControlFile(tmp_path / CONTROL_FILE, SESSION, far)
+    return ControlFolder(tmp_path, SESSION, far)
 
 
 def command(number=1, command="pause", age_s=0.0, **fields):
@@ -32,11 +34,11 @@ def command(number=1, command="pause", age_s=0.0, **fields):
 
 
 def put(control, content):
-    """As a page does it: a new file in place of the old one."""
+    """As a page does it: a file for each, whole when it appears."""
     text = content if isinstance(content, bytes) else json.dumps(content).encode()
-    new = control._path.with_suffix(".new")
-    new.write_bytes(text)
-    new.replace(control._path)
+    path = control._folder / control_name(next(LAID))
+    path.with_suffix(".new").write_bytes(text)
+    path.with_suffix(".new").replace(path)
 
 
 def test_good_commands_are_taken_once(control):
@@ -46,7 +48,7 @@ def test_good_commands_are_taken_once(control):
         put(control, command(number, word))
         desk.take(control.poll())
         assert desk.paused is paused
-        assert control.poll() is None, "the same file is not a new command"
+        assert control.poll() is None, "what was taken is gone"
     put(control, command(5, "goal", goal=[10.0, -20.0, 0.5]))
     desk.take(control.poll())
     np.testing.assert_array_equal(desk.goal, [10.0, -20.0, 0.5])
@@ -104,6 +106,22 @@ def test_a_number_is_taken_once_and_never_an_earlier_one(control):
         assert "later command" in control.poll().refused
 
 
+def test_commands_given_between_two_looks_are_all_taken_in_their_order(control):
+    for number, word in enumerate(("pause", "goal", "start"), 1):
+        put(control, command(number, word, goal=[1.0, 2.0, 3.0]))
+    assert [control.poll().command for _ in range(3)] == ["pause", "goal", "start"]
+    assert control.poll() is None
+    assert list(control._folder.iterdir()) == []
+
+
+def test_what_cannot_be_removed_is_read_once(control):
+    (control._folder / control_name(3)).mkdir()
+    assert "no file" in control.poll().refused
+    assert control.poll() is None
+    put(control, command(9))
+    assert control.poll().refused is None
+
+
 def test_a_file_of_somebody_else_is_refused(control, monkeypatch):
     put(control, command())
     monkeypatch.setattr("os.getuid", lambda: 12345)
@@ -111,7 +129,7 @@ def test_a_file_of_somebody_else_is_refused(control, monkeypatch):
 
 
 def test_a_pipe_in_place_of_the_file_is_refused_at_once(control):
-    os.mkfifo(control._path)
+    os.mkfifo(control._folder / control_name(1))
     assert "no file" in control.poll().refused
 
 
@@ -136,7 +154,7 @@ json_values = st.recursive(
     | json_values
 )
 def test_whatever_json_says_nothing_is_raised_and_only_a_fresh_command_is_taken(tmp_path_factory, fields):
-    control = ControlFile(tmp_path_factory.getbasetemp() / "fuzz.json", SESSION, far)
+    control = ControlFolder(tmp_path_factory.getbasetemp(), SESSION, far)
     put(control, fields)
     answer = control.poll()
     assert answer.refused is not None, "no drawn time is of now"
@@ -144,7 +162,7 @@ def test_whatever_json_says_nothing_is_raised_and_only_a_fresh_command_is_taken(
 
 @given(content=st.binary(max_size=200))
 def test_whatever_bytes_say_nothing_is_raised(tmp_path_factory, content):
-    control = ControlFile(tmp_path_factory.getbasetemp() / "bytes.json", SESSION, far)
+    control = ControlFolder(tmp_path_factory.getbasetemp(), SESSION, far)
     put(control, content)
     assert control.poll().refused is not None
 

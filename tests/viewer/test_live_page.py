@@ -17,6 +17,7 @@ from marl_handover.config import TaskConfig
 from marl_handover.hardware.latch import StopLatch
 from marl_handover.perception.calibration import flat_pose
 from marl_handover.runtime.feed import EVENTS_FILE, STATE_FILE, Feed, Reading
+from marl_handover.runtime.steering import Ask
 from marl_handover.task.rules import Command, Rules
 from marl_handover.viewer import live_words
 from marl_handover.viewer.live import LivePage, _picking
@@ -35,7 +36,7 @@ def session(twin_calibration, tmp_path_factory):
             if state is not None and (not states or state["number"] != states[-1]["number"]):
                 states.append(state)
 
-    reader = threading.Thread(target=collect)
+    reader = threading.Thread(target=collect, daemon=True)
     reader.start()
     arguments = ["hardware=twin", f"calibration={twin_calibration}", f"hardware.stop_file={stop}", "policy=exact", "seed=3"]
     assert main(["run", *arguments, f"publish={folder}"]) == 0
@@ -75,6 +76,7 @@ def test_every_state_of_an_episode_can_be_shown(page, session):
         said.add(page._headline.content.split("<b>")[1].split("</b>")[0])
     assert said & {"left arm carries the block", "right arm carries the block"}
     assert "session ended" in said
+    assert [state["armed"] for state in session.states][:: len(session.states) - 1] == [False, True]
     assert "exact" in page._facts.content
     moving = next(state for state in session.states if state["plan"] and state["phase"])
     page.show_state(moving)
@@ -161,11 +163,105 @@ def test_a_page_opened_for_another_cell_shows_the_session_s(server, session, tmp
 
 
 @pytest.mark.parametrize(
+    "fields",
+    [
+        {"arms": [{}]},
+        {"arms": 5},
+        {"plan": [{"pose": [1.0]}]},
+        {"goal": [1.0]},
+        {"block": {"pose": ["a", None, 1]}},
+        {"latch": None},
+        {"failures": None},
+        {"control": {"number": "x"}, "view_control": True},
+        {"cell": {"block": {}}, "session": "another"},
+    ],
+)
+def test_a_state_that_cannot_be_shown_is_said_and_the_page_goes_on(page, session, tmp_path, fields):
+    page.show_state(session.states[-1], over=False)
+    assert page._failure.content == ""
+    page.show_state({**session.states[-1], "doing": "stopped", "quiet_s": 0.0, **fields}, over=False)
+    if "session" not in fields:
+        assert "cannot be shown" in page._failure.content
+    page.stop()
+    assert StopLatch(tmp_path / "stop").is_set()
+    page.show_state(session.states[-1])
+    assert page._failure.content == ""
+
+
+def test_events_without_sense_are_shown_as_they_are(page, session, tmp_path):
+    page.show_state(session.states[-1])
+    odd = [{"pose": [1.0]}, {"goal": []}, {"arm": 1.0}, {"t_s": True}, {"was": [1e14, 0, 0]}, {"pose": ["a", 1]}]
+    (tmp_path / EVENTS_FILE).write_text("".join(json.dumps({"t_s": 1.0, "event": "seen"} | row) + "\n" for row in odd))
+    page.update()
+    assert page._failure.content == ""
+    assert page._log.content.count("seen") == len(odd)
+    assert "seen" in live_words.log([{"t_s": float("nan"), "event": "seen", "pose": [float("nan"), 1.0, 2.0]}])
+
+
+def test_what_was_said_of_a_session_does_not_hold_for_the_next(page, session):
+    state = session.states[-1]
+    page.show_state(state)
+    page._ask(Ask.PAUSE)
+    page.stop()
+    page.update()
+    assert "only be stopped" in page._steering.content
+    assert "latched" in page._stop_note.content
+    page.show_state(state, session="another", view_control=True)
+    assert page._steering.content == ""
+    assert page._stop_note.content == ""
+
+
+def test_a_request_is_followed_until_the_session_has_taken_it(page, session, monkeypatch):
+    state = {**session.states[-1], "view_control": True}
+    earlier = {"number": 1, "command": "pause", "goal": None, "refused": None}
+    page.show_state(state, control=earlier)
+    page._ask(Ask.START)
+    page.update()
+    assert "start: asked" in page._steering.content
+    monkeypatch.setattr("marl_handover.viewer.live.MAX_AGE_S", 0.0)
+    page.update()
+    assert "start: the session has not taken it" in page._steering.content
+    page.show_state(state, control={**earlier, "number": page._asked[0], "command": "start"})
+    assert "start: done" in page._steering.content
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({}, "no port"),
+        ({"armed": True}, "no port. Arms hold"),
+        ({"latch": {"set": True, "reason": "x"}}, "no port. To allow motion, at the cell: marl-handover stop clear=true"),
+        ({"armed": True, "latch": {"set": True}}, "no port. Arms hold. To allow motion, at the cell: marl-handover stop clear=true"),
+    ],
+)
+@pytest.mark.parametrize("word", ["stopped", "failed"])
+def test_what_is_said_of_arms_and_stop_at_the_end_is_so(word, fields, said):
+    state = {"doing": word, "text": "no port", "over": True, "latch": {"set": False}} | fields
+    assert f">{said}<" in live_words.headline(Reading(state, False, "", 0.0))
+
+
+@pytest.mark.parametrize(
+    ("number", "transfers", "ended", "over", "said"),
+    [
+        (-1, 0, 0, False, "none yet"),
+        (0, 0, 0, False, "1, transfer 1"),
+        (0, 3, 1, False, "1, ended; transfers: 3"),
+        (1, 2, 1, False, "2, transfer 3"),
+        (1, 2, 1, True, "2, ended; transfers: 2"),
+    ],
+)
+def test_progress_counts_what_was_and_is(session, number, transfers, ended, over, said):
+    totals = {"episodes": ended, "solved": 0, "transfers": transfers}
+    state = session.states[-1] | {"episode": {"number": number, "transfers": transfers}, "totals": totals, "over": over}
+    assert f">{said}<" in live_words.facts(state)
+
+
+@pytest.mark.parametrize(
     ("fields", "word"),
     [
         ({"doing": "paused"}, "paused"),
         ({"doing": "moving", "pausing": True}, "pauses before the next"),
-        ({"doing": "stopped", "text": "fire"}, "stop clear=true"),
+        ({"doing": "stopped", "text": "fire", "latch": {"set": True, "reason": "fire"}}, "stop clear=true"),
         ({"doing": "failed", "text": "no port"}, "no port"),
         ({"doing": "looking", "quiet_s": 60.0}, "said nothing for 60 s"),
         ({"doing": "looking", "latch": {"set": True, "reason": "fire"}}, "STOP IS LATCHED"),

@@ -3,6 +3,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from itertools import pairwise
 
 import pytest
 from viewer_client import Client
@@ -88,6 +89,21 @@ def test_updates_come_at_their_rate_and_end_when_told():
     assert len(times) == 20
     assert time.perf_counter() - begun >= 19 / 100.0 - 1e-3
     assert all(0 <= dt_s <= 0.1 for dt_s in times)
+
+
+def test_after_much_hurry_the_next_update_is_a_period_away():
+    ended, hurry, times = threading.Event(), threading.Event(), []
+
+    def update(dt_s):
+        times.append(time.perf_counter())
+        if len(times) <= 60:
+            hurry.set()
+        elif len(times) == 63:
+            ended.set()
+            hurry.set()
+
+    keep_updating(update, 5.0, ended, hurry)
+    assert max(b - a for a, b in pairwise(times)) < 3.0  # with a period for each of them it would be 12 s
 
 
 def test_a_late_update_is_not_made_up_for():

@@ -1,14 +1,34 @@
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from viewer_client import Client
 
+from marl_handover import policies
+from marl_handover.config import MotionConfig, NoiseConfig
+from marl_handover.envs.backends import NoisyBackend
+from marl_handover.learning.evaluation import random_problems
+from marl_handover.motion.planner import MotionPlanner
+from marl_handover.runtime.loop import ClosedLoop
+from marl_handover.runtime.trace import transfer_row
 from marl_handover.viewer.server import address
-from marl_handover.viewer.trace import TracePage
-from marl_handover.viewer.trace_file import Step, Trace
+from marl_handover.viewer.trace import TracePage, moment_words
+from marl_handover.viewer.trace_file import Step, Trace, read_trace
 
 FRAME_S = 0.02
+
+
+class Nobody(policies.SupervisorPolicy):
+    """Wants no arm to move."""
+
+    def __init__(self, rules):
+        super().__init__(rules, "nobody")
+
+    def act(self, pose, goal, previous_arm):
+        return np.full(4, np.nan)
 
 
 def steps_of(model, lengths, seed=0):
@@ -76,6 +96,36 @@ def test_a_viewer_plays_the_trace_to_its_end_and_jumps_to_an_episode(server, pag
         viewer.wait(lambda: "Episode 1" in viewer.text() and "transfer **0 of 1**" in viewer.text(), 10)
         slider = viewer.input("moment")
         viewer.wait(lambda: viewer.panel[slider]["value"] == page.trace.start_of(1), 10)
+
+
+def test_what_a_file_says_is_text_and_no_page(server, model, tmp_path):
+    made = steps_of(model, [1])
+    evil = made.steps[0]._replace(trouble="<script>alert(1)</script> <img src=x onerror=alert(1)> ![x](http://somewhere/x.png)")
+    page = TracePage(server, model, Trace([evil], [0, 1], [0], None))
+    try:
+        page.want(1)
+        page.update(FRAME_S)
+        assert "alert" in page._text.content
+        assert not any(sign in page._text.content for sign in ("<script", "<img", "!["))
+    finally:
+        page.close()
+
+
+@pytest.mark.parametrize("nobody", [True, False])
+def test_a_session_that_ends_as_nobody_is_to_move_is_not_told_to_have_had_too_many_transfers(model, rules_of, paper, nobody, tmp_path):
+    """The entry is the loop's own; the other one is refused as an arm declines the last transfer there is time for."""
+    rules = rules_of(paper)
+    start, goal = (poses[0] for poses in random_problems(rules, 1, 5))
+    backend = NoisyBackend(model, MotionConfig(), noise=NoiseConfig(), missed_grasps=0.0)
+    [transfer] = ClosedLoop(Nobody(rules), MotionPlanner(model), backend).play(start, goal).transfers
+    if not nobody:
+        transfer = replace(transfer, order=transfer.order._replace(place_mm=goal[:2]))
+    file = tmp_path / "trace.jsonl"
+    file.write_text(json.dumps({"episode": 0, "step": 0, **transfer_row(transfer, rules)}) + "\n")
+    trace = read_trace(file)
+    text = moment_words(rules, trace, trace.moment(1), trace.steps)
+    assert ("no arm to move**" in text) == nobody
+    assert ("too many transfers" in text) == (not nobody)
 
 
 def test_a_scrub_is_as_cheap_in_a_long_trace_as_in_a_short_one(server, model):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from marl_handover import cli
-from marl_handover.errors import CorruptFile, MissingFile
+from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
 from marl_handover.viewer.trace_file import read_trace
 
 LINE = {
@@ -74,6 +74,22 @@ def test_a_sessions_log_gives_its_transfers_the_arms_path_and_the_cell(written):
     assert trace.steps[1].recorded is None
 
 
+@pytest.mark.parametrize("first", [{"t_s": 0.0, "event": "session", "cell": {"name": "paper"}, "symmetry_order": 4}, LINE])
+def test_the_blocks_symmetry_is_the_files_and_a_setting_against_it_is_refused(written, first):
+    trace = read_trace(written(first, {**LINE, "symmetry_order": 4}))
+    assert trace.symmetry(None) == trace.symmetry(4) == 4
+    with pytest.raises(InvalidSetting, match="task.symmetry_order = 2: must be 4, as the trace says"):
+        trace.symmetry(2)
+    old = read_trace(written(LINE))
+    assert (old.symmetry(None), old.symmetry(2)) == (1, 2)
+
+
+def test_lines_of_two_blocks_are_no_trace(written):
+    with pytest.raises(CorruptFile, match=r"line 2\b.*symmetry_order was 4 before"):
+        read_trace(written({**LINE, "symmetry_order": 4}, {**LINE, "symmetry_order": 2}))
+
+
+STATE = {"t_s": 1.0, "event": "state", "joints_rad": [[0.0] * 5] * 2, "gripper_mm": [12.0, 12.0]}
 BAD = [
     ("{", "is not JSON"),
     ("[1]", "not an object"),
@@ -83,12 +99,23 @@ BAD = [
     ({**LINE, "arm": 7}, "no transfer"),
     ({**LINE, "final": "no"}, "final"),
     ({**LINE, "outcome": 3}, "outcome"),
+    ({**LINE, "symmetry_order": 0}, "symmetry_order"),
+    ({**LINE, "symmetry_order": "4"}, "symmetry_order"),
     ({**LINE, "place": None}, "no transfer"),
     ({**LINE, "epsilon_rad": "x"}, "no transfer"),
     ({**LINE, "next_state": {"x": 1}}, "no transfer"),
     ({key: value for key, value in LINE.items() if key != "state"}, "'state' is missing"),
     ({key: value for key, value in LINE.items() if key != "episode"}, "'episode' is missing"),
+    ({**LINE, "outcome": "<img src=x onerror=alert(1)>"}, "outcome"),
+    ({**LINE, "outcome": "none"}, "outcome"),
     ({"event": "state", "t_s": 0.0}, "'joints_rad' is missing"),
+    ({**STATE, "joints_rad": [[0.0] * 5]}, "is not 2 x 5 numbers"),
+    ({**STATE, "joints_rad": [[0.0] * 4] * 2}, "is not 2 x 5 numbers"),
+    ({**STATE, "joints_rad": [[0.0] * 5, [float("inf")] * 5]}, "is not finite"),
+    ({**STATE, "joints_rad": None}, "is not 2 x 5 numbers"),
+    ({**STATE, "gripper_mm": [12.0]}, "is not 2 numbers"),
+    ({**STATE, "t_s": float("nan")}, "is not finite"),
+    ({**STATE, "t_s": [1.0]}, "is not a number"),
     ({"event": "session", "cell": 3}, "no transfer"),
 ]
 
@@ -97,6 +124,11 @@ BAD = [
 def test_a_bad_line_is_named_with_its_number(written, row, words):
     with pytest.raises(CorruptFile, match=rf"line 3\b.*{words}"):
         read_trace(written(LINE, "", row, LINE))
+
+
+def test_a_state_line_before_the_one_before_is_named_with_its_number(written):
+    with pytest.raises(CorruptFile, match=r"line 3\b.*t_s = 0\.5 goes back"):
+        read_trace(written(STATE, {**STATE, "t_s": 1.0}, {**STATE, "t_s": 0.5}))
 
 
 def test_a_file_without_a_transfer_and_one_that_is_not_there_are_named(written, tmp_path):

@@ -71,6 +71,13 @@ def test_a_recorded_transfer_moves_as_it_was_sent(motions, step):
     np.testing.assert_allclose(motion.T_world_block[:, :3, 3], planned.T_world_block[:, :3, 3], atol=1.0)
 
 
+def test_a_recorded_transfer_of_another_cells_arms_is_shown_straight(motions, step):
+    recorded = Recorded(np.array([0.0, 1.0]), np.zeros((2, 1, 5)), np.zeros((2, 1)))
+    motion = motions.ask(5, step._replace(arm=1, recorded=recorded)).result()
+    np.testing.assert_allclose(motion.T_world_block[[0, -1]], [lying(step.state), lying(step.next_state)])
+    assert motion.joints_rad.shape[1:] == (2, 5)
+
+
 def test_only_so_many_motions_are_kept(motions, step):
     for number in range(10, 20):
         motions.ask(number, step._replace(trouble="x")).result()

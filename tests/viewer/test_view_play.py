@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,13 +13,27 @@ from marl_handover.runtime.interactive import InteractiveCell
 from marl_handover.viewer.play import PlayPage
 from marl_handover.viewer.server import address, keep_updating
 from marl_handover.viewer.units import flat
+from marl_handover.viewer.words import plain
 
+EVIL = "<img src=x onerror=alert(1)> ![x](http://somewhere/x.png)"
 SEEN_S = 30.0
+
+
+class Watched(InteractiveCell):
+    """Remembers what the page was told last, and how often it asked."""
+
+    last = None
+    told = 0
+
+    def advance(self, dt_s):
+        self.last = super().advance(dt_s)
+        self.told += 1
+        return self.last
 
 
 @pytest.fixture
 def cell(model):
-    return InteractiveCell(policies.load("exact"), model, seed=3)
+    return Watched(policies.load("exact"), model, seed=3)
 
 
 @pytest.fixture
@@ -75,23 +90,61 @@ def test_a_dragged_block_lies_where_it_was_dragged(viewer, cell):
     viewer.wait(near(viewer, "/block", place), SEEN_S)
 
 
-def test_stop_freezes_everything_until_it_is_cleared_and_gone_on(viewer, cell):
+WISHES = {
+    "goal": lambda viewer: drag(viewer, "/goal_handle", (0.0, 0.0, 0.0)),
+    "block": lambda viewer: drag(viewer, "/block_handle", (160.0, 60.0, 0.2)),
+    "numbers": lambda viewer: viewer.set("x, y [mm], turn [°]", [40.0, 10.0, 90.0]),
+    "problem": lambda viewer: viewer.set("new problem", True),
+    "policy": lambda viewer: viewer.set("policy", "pretrained_b"),
+    "pause": lambda viewer: viewer.set("pause", True),
+}
+
+
+def looked_at(viewer, cell, times=25):
+    """Until the page has looked at the cell so often, and with it at everything it was sent."""
+    told = cell.told
+    viewer.wait(lambda: cell.told >= told + times, SEEN_S)
+
+
+@pytest.mark.parametrize("wish", WISHES.values(), ids=WISHES)
+def test_stop_freezes_everything_and_what_is_asked_for_before_it_is_cleared_is_not_done(viewer, cell, wish):
     viewer.set("STOP", True)
     viewer.wait(lambda: "STOPPED" in viewer.text(), SEEN_S)
-    frozen = cell.advance(0.0)
-    goal = at(viewer, "/goal").copy()
-    for label in ("pause", "new problem"):
-        viewer.set(label, True)
-    drag(viewer, "/goal_handle", (0.0, 0.0, 0.0))
-    viewer.wait(lambda: viewer.panel[viewer.input("clear the stop")]["disabled"] is False, SEEN_S)
-    still = cell.advance(1.0)
-    assert still.t_s == frozen.t_s
-    np.testing.assert_array_equal(still.joints_rad, frozen.joints_rad)
-    np.testing.assert_array_equal(at(viewer, "/goal"), goal)
+    frozen, goal, decider = cell.last, at(viewer, "/goal").copy(), cell._engine.decider
+    assert viewer.panel[viewer.input("clear the stop")]["disabled"] is False
+    wish(viewer)
+    looked_at(viewer, cell)
+    assert cell.last.state == "stopped"
     viewer.set("clear the stop", True)
     viewer.wait(lambda: "Paused" in viewer.text(), SEEN_S)
+    looked_at(viewer, cell)
+    assert cell.last.t_s == frozen.t_s
+    for name in ("joints_rad", "T_world_block", "goal"):
+        np.testing.assert_array_equal(getattr(cell.last, name), getattr(frozen, name))
+    np.testing.assert_array_equal(at(viewer, "/goal"), goal)
+    assert cell._engine.decider is decider
+    assert viewer.panel[viewer.input("policy")]["value"] == "exact"
+    shown = viewer.panel[viewer.input("x, y [mm], turn [°]")]["value"]
+    np.testing.assert_allclose(shown, (*frozen.goal[:2], math.degrees(frozen.goal[2])), atol=0.051)
     viewer.set("go on", True)
     viewer.wait(lambda: "STOPPED" not in viewer.text() and "Paused" not in viewer.text(), SEEN_S)
+
+
+@pytest.mark.parametrize("calls", [("stop", "clear"), ("clear",)])
+def test_a_drag_that_the_page_has_not_looked_at_when_a_stop_is_cleared_is_lost(server, cell, calls):
+    page = PlayPage(server, cell, policies.load("exact"), policies.adapted, ("exact",))
+    if "stop" not in calls:
+        cell.stop()
+    page.update(0.02)
+    goal = cell.last.goal
+    page._goal_handle._note(np.array([40.0, 10.0, 0.0]), "update")
+    for call in calls:
+        getattr(cell, call)()
+    page.update(0.02)
+    np.testing.assert_array_equal(cell.last.goal, goal)
+    page._goal_handle._note(np.array([40.0, 10.0, 0.0]), "update")
+    page.update(0.02)
+    np.testing.assert_allclose(cell.last.goal, (40.0, 10.0, 0.0))
 
 
 def test_a_goal_in_numbers_is_taken_up(viewer):
@@ -106,6 +159,31 @@ def test_another_policy_plays_and_one_that_is_none_is_named(viewer):
     viewer.set("policy", "nonsense")
     viewer.wait(lambda: "nonsense" in viewer.text(), SEEN_S)
     viewer.wait(lambda: viewer.panel[viewer.input("policy")]["value"] == "pretrained_b", SEEN_S)
+
+
+def test_a_failed_choice_is_told_beside_what_goes_on_and_until_something_succeeds(server, cell, model):
+    page = PlayPage(server, cell, policies.load("exact"), policies.adapted, ("exact", "nonsense"))
+    page._policy_choice.value = "nonsense"
+    page._choose(SimpleNamespace(client_id=1))
+    messages = set()
+    for _ in range(200):
+        page.update(0.1)
+        assert "nonsense" in page._state.content
+        assert plain(cell.last.message) in page._state.content
+        messages.add(cell.last.message)
+    assert len(messages) > 2
+    page._policy_choice.value = "exact"
+    page._choose(SimpleNamespace(client_id=1))
+    page.update(0.1)
+    assert "nonsense" not in page._state.content
+
+
+def test_what_a_viewer_sends_for_a_policy_is_text_and_no_page(viewer):
+    viewer.set("policy", EVIL)
+    viewer.wait(lambda: "is not known" in viewer.text(), SEEN_S)
+    assert "alert" in viewer.text()
+    assert "<img" not in viewer.text()
+    assert "![" not in viewer.text()
 
 
 def test_solved_problems_are_counted_and_followed_by_others(viewer):

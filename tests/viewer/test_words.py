@@ -1,17 +1,28 @@
 from __future__ import annotations
 
+import html
 import math
+import re
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from marl_handover.runtime.interactive import Placement, Snapshot
-from marl_handover.viewer.words import decision_words, error_words, place_words, score_words, state_words
+from marl_handover.viewer.words import decision_words, error_words, place_words, plain, score_words, state_words
 
 
 def snapshot(**changes):
     values = dict.fromkeys(Snapshot._fields, 0) | {"state": "moving", "arm": 1, "phase": "transfer", "ratio": math.nan, "message": ""}
     return Snapshot(**(values | changes))
+
+
+@given(st.text())
+def test_plain_text_is_shown_as_it_is_and_is_no_markup(text):
+    shown = plain(text)
+    assert html.unescape(shown) == " ".join(text.split())
+    assert not set(re.sub(r"&#\d+;", "", shown)) & set("<>&[]*_`~|\\\n")
 
 
 def test_places_are_whole_millimetres_without_a_minus_before_zero():
