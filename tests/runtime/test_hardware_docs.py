@@ -14,7 +14,6 @@ from marl_handover.cli import COMMANDS
 from marl_handover.compose import compose
 from marl_handover.runtime.events import Event
 
-BENCHES = {1: "twin", 2: "twin_noise2"}
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
 LINES = re.findall(r"^marl-handover (.+)$", TEXT, re.MULTILINE)
 
@@ -35,14 +34,11 @@ def test_every_event_is_explained(event):
 
 def test_what_the_twin_came_to_is_what_is_stored():
     root = Path(__file__).resolve().parents[2]
-    runs = {noise: json.loads((root / "bench/results/2026-11-22" / f"{name}.json").read_text()) for noise, name in BENCHES.items()}
-    for noise, label in ((1, "calibrated, dead band taken out"), (2, "the last with everything twice as bad")):
-        assert runs[noise]["settings"]["noise"] == noise
-        assert runs[noise]["settings"]["robots"] == 10
-        mm, deg = (runs[noise]["episodes"][f"transfer_{unit}"] for unit in ("mm", "deg"))
-        cells = " | ".join(f"{mm[p]:.2f} mm, {deg[p]:.2f}°" for p in ("p50", "p95"))
-        assert f"| {label} | {cells} |" in TEXT
-    plain, drills = runs[1]["episodes"], runs[1]["drills"]
+    result = json.loads((root / "bench/results/2026-11-22/twin.json").read_text(encoding="utf-8"))
+    plain, drills, settings = result["episodes"], result["drills"], result["settings"]
+    assert (settings["noise"], settings["robots"], settings["policy"]) == (1.0, 10, "pretrained_twin")
+    cells = " | ".join(f"{plain['transfer_mm'][p]:.2f} mm, {plain['transfer_deg'][p]:.2f}°" for p in ("p50", "p95"))
+    assert f"| calibrated, dead band taken out | {cells} |" in TEXT
     assert (plain["count"], plain["first_time"], drills["count"], drills["in_the_end"]) == (200, 1.0, 200, 1.0)
     for part in (plain, drills):
         assert (part["violations"], part["hangs"], part["exceptions"]) == ({}, 0, [])
