@@ -29,6 +29,7 @@ FIELDS = {
 TRACE_FIELDS = {
     *("episode", "step", "state", "goal", "previous_arm", "arm", "final", "place", "alpha", "beta", "next_state", "reward"),
     *("terminated", "truncated", "outcome", "epsilon_rad"),
+    *("symmetry_order", "architecture"),  # which the promise leaves room for
 }
 OUTCOMES = {"success", "wrong_orientation", "wrong_position", "timeout"}
 
