@@ -74,9 +74,10 @@ def test_every_state_of_an_episode_can_be_shown(page, session):
     for state in session.states:
         page.show_state(state, over=state["over"])
         said.add(page._headline.content.split("<b>")[1].split("</b>")[0])
-    assert said & {"left arm carries the block", "right arm carries the block"}
+    # A twin that runs as fast as it can is seen in some of its phases only.
+    assert sum(text.startswith(("left arm ", "right arm ")) for text in said) >= 3
     assert "session ended" in said
-    assert [state["armed"] for state in session.states][:: len(session.states) - 1] == [False, True]
+    assert session.states[-1]["armed"]
     assert "exact" in page._facts.content
     moving = next(state for state in session.states if state["plan"] and state["phase"])
     page.show_state(moving)
