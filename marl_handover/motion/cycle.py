@@ -49,7 +49,7 @@ def timed_phases(paths: CyclePaths, arm: ArmModel, motion: MotionConfig, pick_he
         gap_rad = float(np.abs(before[-1] - after[0]).max())
         if gap_rad > JOINED_RAD:
             raise InvalidSetting(f"the gap in rad before the path {name!r}", gap_rad, f"at most {JOINED_RAD:g}")
-    limits = _limits(arm, motion)
+    limits = motion_limits(arm, motion)
     approach, transfer, retreat = (time_path(path, motion.degree, *limits, motion.sample_s) for path in paths)
     opened = motion.finger_travel_mm
     pieces = [("approach", approach.t_s, approach.joints_rad, np.full(len(approach.t_s), opened))]
@@ -67,8 +67,8 @@ def timed_phases(paths: CyclePaths, arm: ArmModel, motion: MotionConfig, pick_he
     return tuple(phases)
 
 
-def _limits(arm: ArmModel, motion: MotionConfig) -> tuple[Floats, Floats]:
-    """Velocity and acceleration limits (5,) in rad/s and rad/s^2."""
+def motion_limits(arm: ArmModel, motion: MotionConfig) -> tuple[Floats, Floats]:
+    """Velocity and acceleration limits (5,) in rad/s and rad/s^2. Raises :class:`InvalidSetting`."""
     require_between("motion.velocity_share", motion.velocity_share, 0.01, 1.0)
     require_positive("motion.acceleration_deg_s2", motion.acceleration_deg_s2)
     velocities = np.array([arm.description.joint(name).velocity for name in ARM_JOINTS])

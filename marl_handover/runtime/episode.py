@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from marl_handover.arrays import wrap
 from marl_handover.envs.cycle_check import FAILURES
-from marl_handover.task.rules import Outcome
+from marl_handover.task.rules import Outcome, Rules
 
 Floats = NDArray[np.float64]
 
@@ -71,6 +71,23 @@ class Order(NamedTuple):
     place_mm: Floats
     predicted: Floats
     feasible: bool
+
+
+def ordered(rules: Rules, pose: Floats, goal: Floats, action: Floats) -> Order:
+    """What a supervisor's ``action`` (4,) orders to be done with an object at ``pose`` (3,), goal (3,)."""
+    command = rules.decode(action)
+    predicted, feasible = rules.transfer(pose, goal, command)
+    chart = np.array(rules.cell.chart.from_table(command.place_mm), float)
+    target = goal[:2] if command.final else command.place_mm
+    return Order(int(command.arm), bool(command.final), chart, target, predicted, bool(feasible))
+
+
+def finishing(rules: Rules, pose: Floats, goal: Floats) -> Order | None:
+    """Architecture A's final transfer of an object at ``pose`` (3,), if an arm can do it; None in architecture B."""
+    if not rules.external_finish:
+        return None
+    external = rules.external(pose, goal)
+    return Order(int(external.arm), True, np.zeros(2), goal[:2], external.pose, True) if external.arm >= 0 else None
 
 
 @dataclass(frozen=True)

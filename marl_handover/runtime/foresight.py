@@ -13,15 +13,15 @@ from marl_handover.policies import SupervisorPolicy
 Floats = NDArray[np.float64]
 
 
-class Foreseen(NamedTuple):
-    """A transfer to come: where it leaves the object (3,), by which arm, and whether it is to be the last."""
+class Placement(NamedTuple):
+    """A placement to come: ``pose`` (3,) in mm and rad, the arm that places, and whether that is to end the episode."""
 
     pose: Floats
     arm: int
     final: bool
 
 
-def foresee(policy: SupervisorPolicy, pose: ArrayLike, goal: ArrayLike, previous_arm: int) -> list[Foreseen]:
+def foresee(policy: SupervisorPolicy, pose: ArrayLike, goal: ArrayLike, previous_arm: int) -> list[Placement]:
     """The transfers that ``policy`` orders if arms are exact, as many as an episode allows at most.
 
     Args:
@@ -33,7 +33,7 @@ def foresee(policy: SupervisorPolicy, pose: ArrayLike, goal: ArrayLike, previous
     rules, here, there = policy.rules, np.asarray(pose, float), np.asarray(goal, float)
     previous = np.int64(previous_arm)
     limit = rules.config.max_steps
-    ahead: list[Foreseen] = []
+    ahead: list[Placement] = []
     while len(ahead) < limit:
         action = policy.act(here, there, np.asarray(previous))
         early = rules.external_finish and bool(rules.can_finish(here, there).any())
@@ -42,9 +42,9 @@ def foresee(policy: SupervisorPolicy, pose: ArrayLike, goal: ArrayLike, previous
         result = rules.step(here, there, previous, action, transfers_left=np.int64(limit - len(ahead)))
         external = int(result.external_arm)
         if bool(result.feasible):
-            ahead.append(Foreseen(np.array(result.placed, float), int(result.command.arm), bool(result.command.final)))
+            ahead.append(Placement(np.array(result.placed, float), int(result.command.arm), bool(result.command.final)))
         if external >= 0:
-            ahead.append(Foreseen(np.array(result.pose, float), external, True))
+            ahead.append(Placement(np.array(result.pose, float), external, True))
         if bool(result.terminated) or not (bool(result.feasible) or external >= 0):
             break
         here, previous = np.asarray(result.pose, float), result.previous_arm

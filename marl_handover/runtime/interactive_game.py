@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,22 +14,15 @@ from marl_handover.errors import InvalidSetting
 from marl_handover.learning.rollout import nobody_moves
 from marl_handover.motion.cost import motion_cost
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.runtime.episode import Order, moved
+from marl_handover.runtime.episode import Order, finishing, moved, ordered
+from marl_handover.runtime.foresight import Placement
 from marl_handover.task.planner import ExactPlanner
-from marl_handover.task.rules import Outcome, Rules
+from marl_handover.task.rules import Outcome, Rules, carried
 
 Floats = NDArray[np.float64]
 
 MOST_TRANSFERS = LoopConfig().transfers
 """An episode that takes more is given up."""
-
-
-class Placement(NamedTuple):
-    """A placement to come: ``pose`` (3,) in mm and rad, the arm that places, and whether that is to end the episode."""
-
-    pose: Floats
-    arm: int
-    final: bool
 
 
 class Decider:
@@ -60,24 +52,15 @@ class Decider:
 
         Architecture A's final transfer, where an arm can do it, comes before the policy's wishes.
         """
-        rules = self.rules
-        if rules.external_finish:
-            external = rules.external(pose, goal)
-            if external.arm >= 0:
-                return Order(int(external.arm), True, np.zeros(2), goal[:2], external.pose, True)
+        if (finish := finishing(self.rules, pose, goal)) is not None:
+            return finish
         action = self.policy.act(pose, goal, np.asarray(previous))
-        if bool(nobody_moves(action)):
-            return None
-        command = rules.decode(action)
-        predicted, feasible = rules.transfer(pose, goal, command)
-        final = bool(command.final)
-        chart = np.array(rules.cell.chart.from_table(command.place_mm), float)
-        return Order(int(command.arm), final, chart, goal[:2] if final else command.place_mm, predicted, bool(feasible))
+        return None if bool(nobody_moves(action)) else ordered(self.rules, pose, goal, action)
 
     def placed(self, pose: Floats, arm: int, place_mm: Floats) -> Floats:
         """Pose (3,) of a block that ``arm`` takes from ``pose`` to ``place_mm`` (2,)."""
         turn = self.rules.cell.polar(place_mm)[1][arm] - self.rules.cell.polar(pose)[1][arm]
-        return np.array([place_mm[0], place_mm[1], math.remainder(float(pose[2] + turn), 2 * math.pi)])
+        return np.asarray(carried(pose, place_mm, turn), float)
 
     def there(self, pose: Floats, goal: Floats) -> bool:
         """Whether a block at ``pose`` (3,) is at the goal."""

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.motion.body import ball_around, standing_block
+from marl_handover.motion.cycle import motion_limits
 from marl_handover.motion.planner import STILL_MM, MotionPlanner, detour_length, string_length
 from marl_handover.motion.segment import FoundPath, Segment, find_path
 from marl_handover.motion.starts import GRIP_LEAST_MM, SAMPLES, carrying_starts, reaching_starts
@@ -45,9 +45,7 @@ class FreePaths:
         model = planner.model
         self.parked_rad = planner.parked_rad
         self.planned = 0
-        velocities = np.array([model.arm.description.joint(name).velocity for name in ARM_JOINTS])
-        self.velocity_rad_s = self.motion.velocity_share * velocities
-        self.acceleration_rad_s2 = np.full(len(ARM_JOINTS), math.radians(self.motion.acceleration_deg_s2))
+        self.velocity_rad_s, self.acceleration_rad_s2 = motion_limits(model.arm, self.motion)
         middle = (model.cell.r_min_mm + model.cell.r_max_mm) / 2
         self._empty, self._loaded = [], []
         for arm, base in enumerate(model.cell.bases):

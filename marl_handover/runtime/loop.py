@@ -25,7 +25,7 @@ from marl_handover.motion.executor import ROLL_RAD
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import OutOfArmsReach, TransferMotion
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.runtime.episode import SAME_MM, SAME_RAD, Done, Episode, Order, Transfer, moved
+from marl_handover.runtime.episode import SAME_MM, SAME_RAD, Done, Episode, Order, Transfer, finishing, moved, ordered
 from marl_handover.runtime.reach import drawn_in
 from marl_handover.runtime.watching import Haltable, Inset, Truthful, Watchful
 from marl_handover.task.rules import Outcome, Rules, Verdict
@@ -144,18 +144,14 @@ class ClosedLoop:
         if bool(nobody_moves(action)):
             self._wait(run)
             return
-        command = rules.decode(action)
-        predicted, feasible = rules.transfer(seen, run.goal, command)
-        target = run.goal[:2] if command.final else command.place_mm
-        chart = np.array(rules.cell.chart.from_table(command.place_mm), float)
-        order = Order(int(command.arm), bool(command.final), chart, target, predicted, bool(feasible))
+        order = ordered(rules, seen, run.goal, action)
         done = self._move(run.pose, order, seen)
         if rules.external_finish:
             # An order that the rule book forbids costs a transfer, as on exact arms; an arm that refuses ends the attempt.
-            verdict = REFUSED if feasible and not done.tried else rules.external_verdict(done.pose, run.goal, np.int64(NO_ARM))
+            verdict = REFUSED if order.feasible and not done.tried else rules.external_verdict(done.pose, run.goal, np.int64(NO_ARM))
         else:
-            verdict = rules.judge(done.pose, run.goal, command.final, np.bool_(done.tried))
-        penalty = rules.motion_penalty(command.arm, run.pose, done.pose)
+            verdict = rules.judge(done.pose, run.goal, np.bool_(order.final), np.bool_(done.tried))
+        penalty = rules.motion_penalty(np.int64(order.arm), run.pose, done.pose)
         self._record(run, order, done, verdict._replace(reward=verdict.reward - penalty))
 
     def _wait(self, run: _Run) -> None:
@@ -168,15 +164,13 @@ class ClosedLoop:
 
     def _finish(self, run: _Run) -> bool:
         """Architecture A's final transfer, if an arm can do it; whether it was ordered."""
-        if not self.rules.external_finish:
-            return False
         seen = self._seen(run)
-        external = self.rules.external(seen, run.goal)
-        if external.arm < 0:
+        order = finishing(self.rules, seen, run.goal)
+        if order is None:
             return False
-        order = Order(int(external.arm), True, np.zeros(2), run.goal[:2], external.pose, True)
         done = self._move(run.pose, order, seen)
-        self._record(run, order, done, REFUSED if (not done.tried) else self.rules.external_verdict(done.pose, run.goal, external.arm))
+        verdict = self.rules.external_verdict(done.pose, run.goal, np.int64(order.arm)) if done.tried else REFUSED
+        self._record(run, order, done, verdict)
         return True
 
     def _seen(self, run: _Run) -> Floats:

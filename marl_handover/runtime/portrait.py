@@ -18,7 +18,7 @@ from marl_handover.perception.camera import Frame
 from marl_handover.perception.overlay import Mark
 from marl_handover.perception.tracker import Believed, Seen
 from marl_handover.runtime.digest import Digest
-from marl_handover.runtime.foresight import Foreseen, foresee
+from marl_handover.runtime.foresight import Placement, foresee
 from marl_handover.runtime.hardware_backend import HardwareBackend
 from marl_handover.runtime.loop import ClosedLoop
 from marl_handover.runtime.reach import drawn_in
@@ -49,7 +49,7 @@ class Portrait:
         self._about: dict[str, Any] = {"architecture": loop.rules.config.architecture}
         self._armed = False
         self._foreseen_for: Any = None
-        self._plan: list[Foreseen] = []
+        self._plan: list[Placement] = []
 
     def take(self, rows: Iterable[dict[str, Any]]) -> None:
         """Take in events."""

@@ -12,16 +12,7 @@ from marl_handover.hardware.settings import ARMS
 from marl_handover.palette import ALERT, BLUE, GREY, INK, PAPER, YELLOW
 from marl_handover.runtime.events import FAULTS
 from marl_handover.runtime.feed import Reading
-
-DOING = {
-    "approach": "goes to the block",
-    "grasp": "closes its hand",
-    "lift": "lifts the block",
-    "transfer": "carries the block",
-    "lower": "puts the block down",
-    "release": "opens its hand",
-    "retreat": "goes home",
-}
+from marl_handover.viewer.words import DOING
 
 RESTING = {"armed": "holds"}
 """What an arm does that does not move, by the driver's state; else that itself."""

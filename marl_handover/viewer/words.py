@@ -25,6 +25,7 @@ DOING = {
     "release": "opens its hand",
     "retreat": "goes home",
 }
+"""What an arm does, by the phase of its motion."""
 
 STATES = {
     "waiting": "Waiting.",
