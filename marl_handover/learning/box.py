@@ -44,8 +44,8 @@ class BoxAlgorithm(Algorithm):
         self.loss.make_value_estimator(gamma=self.config.gamma)
         self.target = SoftUpdate(self.loss, tau=self.config.tau)
         rate = self.config.learning_rate
-        self.actor_optimizer = torch.optim.Adam(actor_parameters, lr=rate)
-        self.value_optimizer = torch.optim.Adam(value_parameters, lr=rate)
+        self.actor_optimizer = torch.optim.Adam(actor_parameters, lr=rate, fused=True)
+        self.value_optimizer = torch.optim.Adam(value_parameters, lr=rate, fused=True)
 
     def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
         """Loss module (actor, values, targets) and optimisers."""

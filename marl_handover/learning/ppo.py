@@ -39,7 +39,7 @@ class Ppo(Algorithm):
             functional=False,
         ).to(self.device)
         self.advantage = GAE(gamma=self.config.gamma, lmbda=self.config.gae_lambda, value_network=value)
-        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=self.config.learning_rate)
+        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=self.config.learning_rate, fused=True)
 
     def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
         """Loss module (actor and value) and optimiser."""
