@@ -1,10 +1,13 @@
-"""``marl-handover calibrate``: the camera's lens and place, and what every servo's pulse means; of a real cell or of its twin."""
+"""``marl-handover calibrate``: the camera's lens and place, every servo's pulses, how hands hold; of a real cell or its twin."""
 
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from marl_handover.cell import build_cell
 from marl_handover.cell.urdf import ARM_JOINTS
@@ -28,14 +31,14 @@ _SUSPECTS = (
     "cell's?"
 )
 _CUT_MM = 10.0
-WHAT = ("all", "camera", "servos", "sheets")
+WHAT = ("all", "camera", "servos", "grippers", "sheets")
 
 
 @dataclass
 class CalibrateCommand(LabConfig):
     """Settings of ``calibrate``; files go to ``calibration=DIR``."""
 
-    what: str = "all"  # camera, servos (which needs the camera's), all (both), or sheets: writes what has to be printed
+    what: str = "all"  # camera, servos (needs the camera's), grippers (needs both), all, or sheets: writes what has to be printed
     paper: str = "a4"  # of the sheets: a4, a3 or letter
     postures: int = 60  # of each arm
     worst_mm: float = 3.0  # servos that explain the sightings no better are not saved
@@ -64,15 +67,18 @@ def run(config: CalibrateCommand) -> int:
         config.target.validate()
         config.cards.validate(config.target)
         return _sheets(config, model)
-    plugs = plug_in(config, model, config.motion, confirmed)
-    try:
-        assistant: Assistant = plugs.twin or Person(config.cards)
-        if config.what in ("all", "camera"):
-            _camera(config, plugs, assistant)
-        if config.what in ("all", "servos"):
-            _servos(config, plugs, assistant, model)
-    finally:
-        plugs.close()
+    if config.what != "grippers":
+        plugs = plug_in(config, model, config.motion, confirmed)
+        try:
+            assistant: Assistant = plugs.twin or Person(config.cards)
+            if config.what in ("all", "camera"):
+                _camera(config, plugs, assistant)
+            if config.what in ("all", "servos"):
+                _servos(config, plugs, assistant, model)
+        finally:
+            plugs.close()
+    if config.what in ("all", "grippers"):
+        _grippers(config, model)
     return 0
 
 
@@ -135,6 +141,38 @@ def _servos(config: CalibrateCommand, plugs: Plugs, assistant: Assistant, model:
     )
     print(f"-> {config.folder()}")
     assistant.take_cards_off()
+
+
+def _grippers(config: CalibrateCommand, model: CellModel) -> None:
+    from marl_handover.motion.planner import MotionPlanner
+    from marl_handover.runtime.gripper_calibration import PLACES, Grip, GripperCalibration
+    from marl_handover.runtime.gripper_file import save_grippers
+    from marl_handover.runtime.hardware_backend import HardwareBackend
+
+    planner = MotionPlanner(model, config.motion)
+    planner.warm_up()
+    backend = HardwareBackend(model, config.motion, config=config, confirm=confirmed, grippers=False)
+    found: dict[str, Grip] = {}
+    try:
+        assistant: Assistant = backend.lab.twin or Person(config.cards)
+        assistant.stand_block(PLACES[0])
+        backend.reset(np.array(PLACES[0]), config.seed)
+        procedure = GripperCalibration(backend, planner, assistant, _told)
+        for arm, name in enumerate(ARMS):
+            found[name] = grip = procedure.arm(arm)
+            print(
+                f"{name} gripper: {grip.off_mm:+.1f} mm further than set, after {grip.tries} tries: "
+                f"open_us={grip.gripper.open_us} closed_us={grip.gripper.closed_us}"
+            )
+    finally:
+        backend.close()
+    asked = {name: config.hardware.arms[name].gripper for name in ARMS}
+    print(f"-> {save_grippers(config.folder(), asked, {name: grip.gripper for name, grip in found.items()})}")
+
+
+def _told(arm: int, further_mm: float, held: bool) -> None:
+    """One try of a gripper."""
+    print(f"{ARMS[arm]} gripper, {further_mm:+.1f} mm: {'holds' if held else 'does not hold'}", file=sys.stderr)
 
 
 def _require_good(name: str, measured: Measured, worst_mm: float) -> None:

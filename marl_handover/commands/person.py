@@ -66,6 +66,10 @@ class Person:
         """See the protocol."""
         _wait("take the markers off the hands")
 
+    def stand_block(self, place: Sequence[float]) -> None:
+        """See the protocol."""
+        _wait(f"stand the block, its marker up, at about x = {place[0]:g} mm, y = {place[1]:g} mm, hands off the table")
+
 
 def _wait(text: str) -> None:
     if not sys.stdin.isatty():

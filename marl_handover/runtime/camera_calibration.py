@@ -40,6 +40,9 @@ class Assistant(Protocol):
     def take_cards_off(self) -> None:
         """Take them off again."""
 
+    def stand_block(self, place: Sequence[float]) -> None:
+        """Stand the block at ``place`` (3,): x_mm, y_mm, theta_rad."""
+
 
 def calibrate_camera(
     camera: Camera, clock: Clock, board: BoardConfig, assistant: Assistant, name: str, views: int = VIEWS

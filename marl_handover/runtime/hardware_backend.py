@@ -63,6 +63,7 @@ class HardwareBackend:
         confirm: is asked before first moves of a real cell; see :class:`~marl_handover.hardware.driver.ArmDriver`.
         dry_run: do all but the last write. Nothing moves, and the block is taken to be where exact arms would have put it.
         log_path: of the session's log; empty: there is none.
+        grippers: take the hands as ``calibrate what=grippers`` found them, if it did; else as the settings say.
 
     Raises:
         MissingFile, CorruptFile, CalibrationProblem: it was not calibrated.
@@ -80,8 +81,9 @@ class HardwareBackend:
         confirm: Callable[[str], bool] | None = None,
         dry_run: bool = False,
         log_path: str = "",
+        grippers: bool = True,
     ) -> None:
-        self.lab = lab = open_lab(config, model, motion, confirm=confirm, dry_run=dry_run, log_path=log_path)
+        self.lab = lab = open_lab(config, model, motion, confirm=confirm, dry_run=dry_run, log_path=log_path, grippers=grippers)
         self.model, self.motion, self.log = model, motion, lab.log
         self.config, self.clock = lab.config.watch, lab.clock
         self.chart_inset = config.chart_inset

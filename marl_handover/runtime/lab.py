@@ -20,6 +20,7 @@ from marl_handover.perception.detector import Detector
 from marl_handover.perception.sources import open_camera
 from marl_handover.perception.tracker import Tracker
 from marl_handover.runtime.events import EventLog
+from marl_handover.runtime.gripper_file import with_grippers
 from marl_handover.runtime.play import FILE as PLAY_FILE
 from marl_handover.runtime.play import Play, half_bands_rad, load_play
 from marl_handover.runtime.servo_files import NAMES, SET_FILE, arm_file, require_one_set
@@ -94,8 +95,9 @@ def open_lab(
     confirm: Callable[[str], bool] | None = None,
     dry_run: bool = False,
     log_path: str = "",
+    grippers: bool = True,
 ) -> Lab:
-    """A calibrated cell.
+    """A calibrated cell; without ``grippers`` the hands are as the settings say.
 
     Raises:
         MissingFile, CorruptFile, CalibrationProblem, CalibrationMismatch: ``calibrate`` has to be run first, or again.
@@ -110,6 +112,8 @@ def open_lab(
     plugs = plug_in(config, model, motion, confirm)
     try:
         hardware = calibrated(plugs.hardware, folder)
+        if grippers:
+            hardware = with_grippers(hardware, folder)
         play = Play(half_bands_rad(half_us, calibrations(hardware, model.arm)), model.arm.lower_rad, model.arm.upper_rad)
         driver = ArmDriver(
             hardware, model, motion, clock=plugs.clock, latch=StopLatch(hardware.stop_path()), confirm=plugs.confirm, dry_run=dry_run

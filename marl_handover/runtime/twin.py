@@ -145,6 +145,10 @@ class Twin:
         """The hands are free."""
         self._cards = []
 
+    def stand_block(self, place: Sequence[float]) -> None:
+        """Somebody stands the block at ``place`` (3,): x_mm, y_mm, theta_rad."""
+        self.nudge(place)
+
     def _servos(self, t_s: float) -> ServoState:
         return ServoState(self.electronics.joints_rad(t_s), self.electronics.gripper_mm(t_s))
 
