@@ -31,6 +31,14 @@ def wrap(angle_rad: Array) -> Array:
     return xp.remainder(angle_rad + math.pi, 2 * math.pi) - math.pi
 
 
+def length(vector: Array) -> Array:
+    """Euclidean lengths (...) of vectors (..., n). The gradient at a vector of zeros is 0; the root's own would be NaN."""
+    xp = namespace(vector)
+    square = (vector**2).sum(-1)
+    some = square > 0
+    return xp.where(some, xp.sqrt(xp.where(some, square, xp.ones_like(square))), square)
+
+
 def select(values: Array, index: Array) -> Array:
     """``values[..., index]`` elementwise: ``values`` of shape (..., n), integer ``index`` of shape (...), result of shape (...)."""
     if isinstance(values, np.ndarray):

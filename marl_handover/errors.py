@@ -115,6 +115,15 @@ class NotFinite(HandoverError):
         self.what, self.value = what, value
 
 
+class Diverged(WorkFailed):
+    """A training whose losses are no numbers any more: what it would learn from here on is nothing."""
+
+    def __init__(self, step: int, losses: dict[str, float]) -> None:
+        found = ", ".join(f"{name} = {value}" for name, value in losses.items())
+        super().__init__(f"training diverged before step {step}: {found}; try a smaller algorithm.learning_rate or another seed")
+        self.step, self.losses = step, losses
+
+
 class CheckpointMismatch(HandoverError):
     """A checkpoint was made for other settings than the ones asked for."""
 

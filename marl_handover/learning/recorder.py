@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
 from tqdm import tqdm
 
+from marl_handover.errors import Diverged
 from marl_handover.files import write_whole
 
 COLUMNS = (
@@ -79,6 +82,14 @@ class Recorder:
         """Flush the events and end the bar."""
         self.board.close()
         self.bar.close()
+
+
+def require_sound(step: int, losses: Mapping[str, Tensor]) -> None:
+    """Raise :class:`Diverged` if a loss is no number any more."""
+    values = {name: float(loss) for name, loss in losses.items() if name.startswith("loss_")}
+    bad = {name: value for name, value in values.items() if not math.isfinite(value)}
+    if bad:
+        raise Diverged(step, bad)
 
 
 def _text(value: float | None) -> str:

@@ -21,7 +21,7 @@ from marl_handover.learning.algorithm_settings import OffPolicyConfig, PpoConfig
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
 from marl_handover.learning.curriculum import Curriculum
 from marl_handover.learning.experience import Collected
-from marl_handover.learning.recorder import Recorder
+from marl_handover.learning.recorder import Recorder, require_sound
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.variants import make_variant
 from marl_handover.task.planner import ExactPlanner
@@ -147,6 +147,7 @@ class Trainer:
     def _report(self, recorder: Recorder) -> None:
         counters = self.counters
         if counters.step >= counters.next_evaluation or counters.step >= self.config.steps:
+            require_sound(counters.step, self.losses)
             counters.next_evaluation += self.config.evaluation_interval
             self.last = self.evaluate()
             self._keep_best()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from marl_handover.arrays import Array, namespace, select
+from marl_handover.arrays import Array, length, namespace, select
 from marl_handover.cell import Cell
 
 FIELDS = ("from_radius", "from_cos", "from_sin", "to_radius", "to_cos", "to_sin", "turn", "distance")
@@ -27,7 +27,7 @@ def way_features(cell: Cell, arm: Array, from_mm: Array, to_mm: Array, fold: boo
     one = xp.ones_like(yaw_1)
     sign = xp.where(yaw_2 < yaw_1, -one, one) if fold else one
     middle, half = (cell.r_max_mm + cell.r_min_mm) / 2, (cell.r_max_mm - cell.r_min_mm) / 2
-    distance = xp.sqrt(((to_mm - from_mm) ** 2).sum(-1))
+    distance = length(to_mm - from_mm)
     fields = [
         xp.clip((radius_1 - middle) / half, -3.0, 3.0),
         xp.cos(yaw_1),

@@ -105,10 +105,12 @@ def profiles_figure(results: Tree, spec: Tree) -> Figure | None:
     figure = Figure(figsize=(7.2, 4.4), layout="constrained")
     axes = figure.add_subplot()
     thresholds = np.array(profiles["thresholds"])
-    for index, (name, band) in enumerate(profiles["rows"].items()):
+    names = [name for name in spec["rows"] or profiles["rows"] if name in profiles["rows"]]  # the other figures' order: colours agree
+    for index, name in enumerate(names):
+        band = profiles["rows"][name]
         style: Mapping[str, Any] = series_style(index)
         # Where curves lie on each other, the lower ones show beside the upper.
-        width = 1.4 + 2.6 * (1 - (index + 1) / len(profiles["rows"]))
+        width = 1.4 + 2.6 * (1 - (index + 1) / len(names))
         axes.plot(thresholds, band["value"], label=labels[name], linewidth=width, drawstyle="steps-post", **style)
         axes.fill_between(thresholds, band["low"], band["high"], color=style["color"], alpha=0.15, linewidth=0, step="post")
     axes.set_xlim(thresholds[0], thresholds[-1] + 0.02 * (thresholds[-1] - thresholds[0]))

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple
 
-from marl_handover.arrays import Array, namespace, one_where, select, wrap
+from marl_handover.arrays import Array, length, namespace, one_where, select, wrap
 from marl_handover.cell.cell import REACH_TOLERANCE_MM, Cell
 from marl_handover.config import TaskConfig
 
@@ -89,8 +89,7 @@ class Transition(NamedTuple):
 
 def straight_line_mm(cell: Cell, arm: Array, start_mm: Array, end_mm: Array) -> Array:
     """Length of the straight line from pick-up to drop-off: the simplest :data:`MotionCost`."""
-    xp = namespace(start_mm)
-    return xp.sqrt(((end_mm - start_mm) ** 2).sum(-1))
+    return length(end_mm - start_mm)
 
 
 def carried(pose: Array, target_mm: Array, turn_rad: Array) -> Array:

@@ -267,3 +267,16 @@ def test_other_algorithms_are_refused_by_name(small, algorithm):
     env = variant.env(config, torch.device("cpu"))
     with pytest.raises(UnknownChoice, match=algorithm):
         variant.algorithm(env.rules, config, torch.Generator())
+
+
+def test_a_block_that_is_put_down_where_it_stands_leaves_the_gradients_finite(trainer):
+    """At the corners of the chart the tanh saturates, and a policy that likes one orders exactly the place the block was put at before."""
+    cell, loss = trainer.rules.cell, trainer.algorithm.loss
+    corner = torch.tensor([[1.0, 1.0], [-1.0, 1.0], [0.3, -0.2]], requires_grad=True)
+    place = cell.chart.to_table(corner[:, 0], corner[:, 1])
+    way, _ = loss.actor.way(torch.tensor([0, 1, 0]), place.detach(), place)
+    assert (way[:, -1] == 0).all()
+    loss.actor.motion(way)[0].sum().backward()
+    assert corner.grad.isfinite().all()
+    assert all(parameter.grad.isfinite().all() for parameter in loss.actor.move.parameters())
+    loss.actor.zero_grad()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from marl_handover.errors import Diverged
 from marl_handover.learning.rollout import play
 from marl_handover.learning.trainer import Trainer
 from marl_handover.policies import RandomPolicy
@@ -40,6 +41,14 @@ def test_hybrid_sac_solves_15_degrees_in_3072_steps(small, tmp_path):
 def test_ppo_beats_random_actions(small, tmp_path):
     trainer, rate = learned(small, tmp_path, "ppo", 12_288, 60, "learning_rate=2e-3", "rollout_steps=16", "epochs=4")
     assert rate > random_rate(trainer.rules) + 0.1  # (0.47, 0.79; random 0.12)
+
+
+def test_a_training_that_diverges_says_so_and_stops(small, tmp_path):
+    made = Trainer(small("box_sac", "steps=512", "evaluation_interval=256", "algorithm.learning_rate=1e30"), tmp_path)
+    with pytest.raises(Diverged, match=r"diverged before step 256: loss_\w+ = (nan|inf).*learning_rate") as told:
+        made.run()
+    assert told.value.step == 256
+    assert "nan" not in (tmp_path / "metrics.csv").read_text()
 
 
 @pytest.mark.slow

@@ -30,7 +30,11 @@ def hands(twin_calibration, tmp_path, model, planner):
 
     def make(off_us):
         config = twin_lab()
-        config.calibration, config.watch, config.hardware.stop_file = str(twin_calibration), WatchConfig(patience_s=4.0), str(tmp_path / "s")
+        config.calibration, config.watch, config.hardware.stop_file = (
+            str(twin_calibration),
+            WatchConfig(patience_s=4.0),
+            str(tmp_path / "s"),
+        )
         backend = HardwareBackend(model, MotionConfig(), config=config, grippers=False)
         opened.append(backend)
         twin = backend.lab.twin
