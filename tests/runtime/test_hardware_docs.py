@@ -42,5 +42,8 @@ def test_what_the_twin_came_to_is_what_is_stored():
     assert (plain["count"], plain["first_time"], drills["count"], drills["in_the_end"]) == (200, 1.0, 200, 1.0)
     for part in (plain, drills):
         assert (part["violations"], part["hangs"], part["exceptions"]) == ({}, 0, [])
+    twice = json.loads((root / "bench/results/2026-11-22/twin_noise2.json").read_text(encoding="utf-8"))
+    assert (twice["settings"]["noise"], twice["episodes"]["count"], twice["episodes"]["first_time"]) == (2.0, 100, 0.99)
+    assert "99 of 100 were solved at the first final placement" in " ".join(TEXT.split())
     for text in (TEXT, (root / "README.md").read_text(encoding="utf-8")):
         assert "200 of 200 in the end" in " ".join(text.split())
