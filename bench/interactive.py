@@ -27,7 +27,7 @@ from common import ROOT, commit, machine, parse, table
 
 from marl_handover.cell.build import build_cell
 from marl_handover.policies import load
-from marl_handover.runtime.interactive import InteractiveCell, Snapshot
+from marl_handover.runtime.interactive.cell import InteractiveCell, Snapshot
 
 DEFAULTS = {"changes": 300, "policies": "exact,pretrained_b", "drags": 10, "speed": 4.0, "seed": 0, "results": "bench/results"}
 LIMIT_MS = 100.0

@@ -134,7 +134,7 @@ def _changed(group: str, values: Mapping[str, Any], usual: Mapping[str, Any]) ->
 def _play(config: ViewCommand, server: Server) -> Iterator[Page]:
     from marl_handover import policies
     from marl_handover.cell import build_cell
-    from marl_handover.runtime.interactive import InteractiveCell
+    from marl_handover.runtime.interactive.cell import InteractiveCell
     from marl_handover.viewer.play import RATE_HZ, SPEEDS, PlayPage
 
     require_between("speed", config.speed, *SPEEDS)

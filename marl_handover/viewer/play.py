@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from marl_handover.config import require_choice
 from marl_handover.errors import HandoverError
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.runtime.interactive import InteractiveCell, Snapshot
+from marl_handover.runtime.interactive.cell import InteractiveCell, Snapshot
 from marl_handover.viewer.handles import PlaneHandle
 from marl_handover.viewer.inputs import by_hand, number, write
 from marl_handover.viewer.reach import within_reach

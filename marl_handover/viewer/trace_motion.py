@@ -16,7 +16,7 @@ from marl_handover.config import MotionConfig
 from marl_handover.errors import HandoverError
 from marl_handover.motion.grasp import level_joints
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.runtime.interactive_body import lying
+from marl_handover.runtime.interactive.body import lying
 from marl_handover.viewer.trace_file import Recorded, Step
 
 Floats = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.runtime.interactive import Placement, Snapshot
+from marl_handover.runtime.interactive.cell import Placement, Snapshot
 from marl_handover.task.rules import Rules
 
 Floats = NDArray[np.float64]

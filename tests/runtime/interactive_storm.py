@@ -11,7 +11,7 @@ from marl_handover import policies
 from marl_handover.cell.collision import capsule_pairs, segment_distance
 from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.motion.body import block_capsules
-from marl_handover.runtime.interactive import InteractiveCell, Snapshot
+from marl_handover.runtime.interactive.cell import InteractiveCell, Snapshot
 
 DT_S = 0.02
 EXACT_MM = 0.05

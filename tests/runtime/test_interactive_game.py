@@ -14,7 +14,7 @@ from marl_handover.commands.plan import solve
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.learning.evaluation import random_problems
-from marl_handover.runtime.interactive_game import Decider, Score
+from marl_handover.runtime.interactive.game import Decider, Score
 from marl_handover.task.planner import ExactPlanner
 
 

@@ -20,7 +20,7 @@ from interactive_storm import (
 
 from marl_handover.cell.collision import ground_clearance_mm, self_clearance_mm
 from marl_handover.motion.trajectory import NoPath
-from marl_handover.runtime.interactive_paths import FreePaths
+from marl_handover.runtime.interactive.paths import FreePaths
 
 STORMS = [
     pytest.param(("exact", 50), id="exact"),

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from marl_handover.cell.spaces import points_in_base
 from marl_handover.motion.trajectory import NoPath, OutOfArmsReach
-from marl_handover.runtime.interactive_paths import FreePaths
-from marl_handover.runtime.interactive_tracks import stopped
+from marl_handover.runtime.interactive.paths import FreePaths
+from marl_handover.runtime.interactive.tracks import stopped
 
 shares = st.floats(0.02, 0.98)
 places = st.tuples(st.floats(151.0, 229.0), st.floats(-85.0, 85.0))

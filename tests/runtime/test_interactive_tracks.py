@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from marl_handover.motion.splines import evaluate
 from marl_handover.motion.timing import time_path
-from marl_handover.runtime.interactive_tracks import DELAYS, STEP_S, Track, joined, still, stopped
+from marl_handover.runtime.interactive.tracks import DELAYS, STEP_S, Track, joined, still, stopped
 
 VELOCITY = np.array([4.6, 3.6, 3.6, 4.2, 7.6])
 ACCELERATION = np.full(5, 14.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from marl_handover.cell.symmetry import LEFT
-from marl_handover.runtime.interactive_body import lying
+from marl_handover.runtime.interactive.body import lying
 from marl_handover.viewer.trace_file import Recorded, Step
 from marl_handover.viewer.trace_motion import Motions
 

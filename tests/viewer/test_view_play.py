@@ -9,7 +9,7 @@ import pytest
 from viewer_client import Client
 
 from marl_handover import policies
-from marl_handover.runtime.interactive import InteractiveCell
+from marl_handover.runtime.interactive.cell import InteractiveCell
 from marl_handover.viewer.play import PlayPage
 from marl_handover.viewer.server import address, keep_updating
 from marl_handover.viewer.units import flat

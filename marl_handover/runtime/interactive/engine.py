@@ -14,10 +14,10 @@ from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.errors import WorkFailed
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.runtime.episode import SAME_MM, Order
-from marl_handover.runtime.interactive_body import Body
-from marl_handover.runtime.interactive_game import MOST_TRANSFERS, Decider, Placement, Score
-from marl_handover.runtime.interactive_paths import FreePaths
-from marl_handover.runtime.interactive_programs import Programs
+from marl_handover.runtime.interactive.body import Body
+from marl_handover.runtime.interactive.game import MOST_TRANSFERS, Decider, Placement, Score
+from marl_handover.runtime.interactive.paths import FreePaths
+from marl_handover.runtime.interactive.programs import Programs
 from marl_handover.task.problems import sample_problems
 
 Floats = NDArray[np.float64]

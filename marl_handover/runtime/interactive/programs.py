@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from marl_handover.errors import WorkFailed
 from marl_handover.runtime.episode import Order
-from marl_handover.runtime.interactive_body import Body, Piece
-from marl_handover.runtime.interactive_paths import FreePaths
-from marl_handover.runtime.interactive_tracks import STEP_S, Track, joined, still, stopped
+from marl_handover.runtime.interactive.body import Body, Piece
+from marl_handover.runtime.interactive.paths import FreePaths
+from marl_handover.runtime.interactive.tracks import STEP_S, Track, joined, still, stopped
 
 Floats = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from marl_handover.motion.planner import STILL_MM, MotionPlanner, detour_length,
 from marl_handover.motion.segment import FoundPath, Segment, find_path
 from marl_handover.motion.starts import GRIP_LEAST_MM, SAMPLES, carrying_starts, reaching_starts
 from marl_handover.motion.timing import time_path
-from marl_handover.runtime.interactive_tracks import STEP_S, Track, still
+from marl_handover.runtime.interactive.tracks import STEP_S, Track, still
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from marl_handover.cell.build import CellModel
 from marl_handover.cell.kinematics import transform
 from marl_handover.motion.cycle import LIFTED_MM
-from marl_handover.runtime.interactive_tracks import Track
+from marl_handover.runtime.interactive.tracks import Track
 
 Floats = NDArray[np.float64]
 

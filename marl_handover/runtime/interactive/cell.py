@@ -21,9 +21,9 @@ from marl_handover.config import MotionConfig, require_at_least, require_seed
 from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.runtime.interactive_body import projected
-from marl_handover.runtime.interactive_engine import Engine
-from marl_handover.runtime.interactive_game import Decider, Placement
+from marl_handover.runtime.interactive.body import projected
+from marl_handover.runtime.interactive.engine import Engine
+from marl_handover.runtime.interactive.game import Decider, Placement
 
 __all__ = ["InteractiveCell", "Placement", "Snapshot"]
 
