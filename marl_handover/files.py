@@ -9,8 +9,8 @@ from pathlib import Path
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a file so that a reader sees the old one or the new one, never half of it."""
-    temporary = path.with_name(path.name + ".tmp")
+    """Write a file so that a reader sees the old one or the new one, never half of it; of two writers, the later one's."""
+    temporary = temporary_of(path)
     try:
         with temporary.open("w", encoding="utf-8") as stream:
             stream.write(text)
@@ -19,6 +19,11 @@ def write_whole(path: Path, text: str) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def temporary_of(path: Path) -> Path:
+    """Where this process writes what is to become ``path``: another one at the same time has a name of its own."""
+    return path.with_name(f"{path.name}.{os.getpid()}.tmp")
 
 
 def keep(path: Path) -> Path | None:

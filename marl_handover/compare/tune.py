@@ -25,7 +25,7 @@ from optuna.trial import Trial, TrialState
 from marl_handover.compare.launch import Failure, fan_out
 from marl_handover.compare.records import settings_of, usual_settings
 from marl_handover.compare.tune_space import Parameter, applied, value_of
-from marl_handover.compare.tune_storage import abandoned, claimed, counted, ended, give_back, open_study, place_of, running
+from marl_handover.compare.tune_storage import abandoned, asked, claimed, counted, ended, give_back, open_study, place_of, running
 from marl_handover.compare.workers import summary
 from marl_handover.config import MAX_SEED
 from marl_handover.errors import HandoverError, WorkFailed
@@ -152,7 +152,7 @@ def run_trial(search: Search, slot: str) -> Note | None:
     _take_back(study, slot)
     if counted(study) >= search.trials:
         return None
-    trial = study.ask()
+    trial = asked(study, search.storage, search.folder)
     study.sampler = TPESampler(seed=_seed(search.seed, place_of(study, trial.number), "proposals"))
     try:
         with claimed(trial, slot):

@@ -20,6 +20,7 @@ from optuna.study import Study
 from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
+from marl_handover.compare.locks import held
 from marl_handover.errors import HandoverError
 
 BEAT_S = 60.0
@@ -92,6 +93,14 @@ def open_study(storage: str, name: str, pruner: optuna.pruners.BasePruner | None
             direction="maximize",
             load_if_exists=True,
         )
+
+
+def asked(study: Study, storage: str, folder: Path) -> Trial:
+    """The next trial. SQLite locks no rows: without the lock beside ``folder`` two processes may be given the same queued one."""
+    if not storage.startswith("sqlite"):
+        return study.ask()
+    with held(folder / "ask", wait_s=SQLITE_WAIT_S):
+        return study.ask()
 
 
 def counted(study: Study) -> int:

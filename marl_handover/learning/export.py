@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from marl_handover.cell import load_cell
 from marl_handover.errors import CorruptFile
+from marl_handover.files import temporary_of
 from marl_handover.learning.algorithm import Algorithm
 from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.checkpoint import FILE, load_checkpoint
@@ -53,7 +54,7 @@ def policy_arrays(algorithm: Algorithm, config: TrainConfig, origin: str) -> Arr
 
 def save_policy(path: Path, arrays: Arrays) -> None:
     """Write a policy file as a whole."""
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = temporary_of(path)
     with temporary.open("wb") as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]
     temporary.replace(path)

@@ -32,6 +32,7 @@ from marl_handover.cell.cell import REACH_TOLERANCE_MM
 from marl_handover.compose import to_yaml
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.errors import CorruptFile, HandoverError, MissingFile
+from marl_handover.files import temporary_of
 from marl_handover.resources import package_path
 from marl_handover.task.rules import MotionCost, straight_line_mm
 
@@ -84,7 +85,7 @@ class CostTable:
 
     def save(self, path: Path) -> None:
         """Write it whole, then rename."""
-        temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+        temporary = temporary_of(path)
         with temporary.open("wb") as stream:
             np.savez_compressed(stream, **asdict(self))
         temporary.replace(path)

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
-from marl_handover.files import write_whole
+from marl_handover.files import temporary_of, write_whole
 
 PICTURES = (".png", ".pdf", ".svg")
 DOTS_PER_INCH = 150
@@ -61,7 +61,7 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 @contextmanager
 def _writable(path: Path, name: str) -> Iterator[Path]:
     """Make the folder of ``path``, give the temporary file's path, and leave no temporary file behind, whatever happens."""
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = temporary_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.errors import InvalidSetting
+from marl_handover.files import temporary_of
 from marl_handover.hardware.errors import Stopped
 from marl_handover.perception.camera import Frame
 from marl_handover.perception.overlay import annotated, jpeg
@@ -236,7 +237,7 @@ def _ending(error: BaseException | None) -> tuple[str, str]:
 
 def _replace(path: Path, content: bytes) -> None:
     """Write a file as a whole. Not flushed to the disk, as files are that have to outlive a loss of power: these tell of now."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    temporary = temporary_of(path)
     try:
         temporary.write_bytes(content)
         temporary.replace(path)

@@ -12,6 +12,7 @@ import threading
 import time
 from collections import Counter
 from contextlib import closing
+from pathlib import Path
 from typing import NamedTuple
 
 import cloudpickle
@@ -176,6 +177,18 @@ evaluations:
 """
 
 
+def holder(folder):
+    """The process that has the lock of a task's folder, or None."""
+    inode = folder.with_name(f"{folder.name}.lock").stat().st_ino
+    held = (line.split() for line in Path("/proc/locks").read_text().splitlines() if "FLOCK" in line and "->" not in line)
+    return next((int(fields[4]) for fields in held if int(fields[5].split(":")[2]) == inode), None)
+
+
+def parent(pid):
+    """The process that started another."""
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
 @pytest.mark.slow
 def test_a_suite_survives_the_death_of_a_node(cluster, two_nodes, tmp_path, caplog):
     (tmp_path / "small.yaml").write_text(SUITE)
@@ -183,10 +196,18 @@ def test_a_suite_survives_the_death_of_a_node(cluster, two_nodes, tmp_path, capl
     early = {}
 
     def kill():
-        while not (early and any(not (run.parent / "done.json").exists() for run in out.glob("b/seed*/run"))):
+        worker = None
+        while not (early and worker):
             early.update({path: path.stat().st_mtime_ns for path in out.glob("b/seed*/*.json") if (path.parent / "done.json").exists()})
+            worker = next(
+                filter(None, (holder(run.parent) for run in out.glob("b/seed*/run") if not (run.parent / "done.json").exists())), None
+            )
             time.sleep(0.02)
-        cluster.remove_node(two_nodes[0], allow_graceful=False)
+        os.kill(worker, signal.SIGSTOP)  # a worker outlives its node by a moment, in which it could finish
+        (node,) = [node for node in two_nodes if node.all_processes["raylet"][0].process.pid == parent(worker)]
+        cluster.remove_node(node, allow_graceful=False)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(worker, signal.SIGKILL)
 
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()

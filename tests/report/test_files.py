@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 from matplotlib.figure import Figure
 
@@ -46,3 +49,22 @@ def test_reading_json(tmp_path):
         (tmp_path / "a.json").write_text(text)
         with pytest.raises(CorruptFile):
             read_json(tmp_path / "a.json", "plan")
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from marl_handover.files import write_whole
+for _ in range(300):
+    write_whole(Path(sys.argv[1]), sys.argv[2] * 5000)
+"""
+
+
+def test_two_processes_that_write_one_file_leave_one_of_both_wholly(tmp_path):
+    path = tmp_path / "a.txt"
+    writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(path), letter]) for letter in "ab"]
+    while any(writer.poll() is None for writer in writers):
+        if path.exists():
+            assert path.read_text() in ("a" * 5000, "b" * 5000)
+    assert [writer.returncode for writer in writers] == [0, 0]
+    assert list(tmp_path.iterdir()) == [path]
