@@ -16,7 +16,6 @@ from marl_handover.cell.build import CellModel
 from marl_handover.cell.collision import capsule_pairs, joints_before
 from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.motion.kernels import FAR_MM, beyond, nearest
-from marl_handover.motion.scene import FAST
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -48,7 +47,7 @@ def arm_shapes(model: CellModel) -> Shapes:
     return Shapes(pivots, np.array(rows, float), np.stack([first, second], axis=1).astype(np.int64))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def place(q: Floats, shapes: Shapes, x: float, y: float, facing: float, out: Floats) -> None:
     """Fill ``out`` (K, 10) with the placed segments, rows as in the planner's kernels, of an arm at joints ``q`` (5,), base at (x, y)."""
     pivots, capsules = shapes.pivots, shapes.capsules
@@ -83,7 +82,7 @@ def place(q: Floats, shapes: Shapes, x: float, y: float, facing: float, out: Flo
         out[k, 9] = 0.5 * math.sqrt(square)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def alone_mm(Q: Floats, shapes: Shapes, out: Floats) -> None:
     """Fill ``out`` (2,): smallest height over the table of the links after the turret, and smallest distance of the arm to itself.
 
@@ -104,7 +103,7 @@ def alone_mm(Q: Floats, shapes: Shapes, out: Floats) -> None:
                 out[1] = min(out[1], nearest(placed, a, placed, b, point) - need)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def between_mm(Q: Floats, others: Floats, together: bool, shapes: Shapes, base: Floats, other_base: Floats) -> float:
     """Smallest distance of two arms over their joint samples ``Q`` (S, 5) and ``others`` (N, 5); bases are (x, y, facing).
 

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from marl_handover.motion.objective import LEVER_MM, Price, columns, lagrangian
-from marl_handover.motion.scene import FAST, Scene
+from marl_handover.motion.scene import Scene
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class Sampled(NamedTuple):
     values: Floats
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def descend(points: Floats, spline: Spline, scene: Scene, weights: Floats, effort: Effort) -> tuple[Floats, float, int]:
     """Improve control points (N, 4), ends fixed.
 
@@ -81,7 +81,7 @@ def descend(points: Floats, spline: Spline, scene: Scene, weights: Floats, effor
     return x, worst, evaluations
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _minimise(
     x: Floats, rho: float, held: Held, now: Sampled, spline: Spline, scene: Scene, weights: Floats, effort: Effort, H: Floats
 ) -> tuple[Floats, float, int]:
@@ -117,7 +117,7 @@ def _minimise(
     return x, f, evaluations
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _update(H: Floats, s: Floats, y: Floats) -> None:
     """The BFGS update of an inverse Hessian, in place; left out where the curvature is not positive."""
     sy = np.dot(s, y)
@@ -130,7 +130,7 @@ def _update(H: Floats, s: Floats, y: Floats) -> None:
             H[a, b] += factor * s[a] * s[b] - (Hy[a] * s[b] + s[a] * Hy[b]) / sy
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate(x: Floats, rho: float, held: Held, now: Sampled, spline: Spline, scene: Scene, weights: Floats) -> tuple[float, Floats]:
     """The augmented Lagrangian at control points ``x`` (N, 4) and its gradient over the inner ones, flat."""
     B, limits, Q, grad, limit = spline.B, spline.limits, now.Q, now.grad, held.limit
@@ -158,7 +158,7 @@ def _evaluate(x: Floats, rho: float, held: Held, now: Sampled, spline: Spline, s
     return f, g.reshape(4 * n)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _times(H: Floats, v: Floats) -> Floats:
     """The product of a symmetric matrix with a vector."""
     out = np.zeros(len(v))
@@ -168,7 +168,7 @@ def _times(H: Floats, v: Floats) -> Floats:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _take_over(x: Floats, values: Floats, held: Held, rho: float, limits: Floats) -> tuple[float, float]:
     """Take over the multipliers; the greatest violation in mm, and what the penalty was."""
     worst, paid, lam, limit = 0.0, 0.0, held.lam, held.limit

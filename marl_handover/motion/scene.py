@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-FAST = {"reassoc", "contract", "arcp", "nsz"}
-"""Liberties the compiler may take with sums and products; NaN and infinity keep their meaning."""
-
 
 class Scene(NamedTuple):
     """One arm, what it holds and what stands around it. Lengths in mm; layouts of the rows: :mod:`marl_handover.motion.kernels`.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from marl_handover.motion.kernels import FAR_MM, at_wrist, beyond, hand_ball, hand_is_away, nearest, pivots, place_capsules, turned
 from marl_handover.motion.objective import first_moving, ramp
-from marl_handover.motion.scene import FAST, Scene
+from marl_handover.motion.scene import Scene
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -44,7 +44,7 @@ class Margins(NamedTuple):
         return min(self.arm, self.block, self.itself, self.ground, self.lift + ROUNDING_MM, self.edge + ROUNDING_MM)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def dense_margins(Q: Floats, scene: Scene, out: Floats) -> float:
     """Fill ``out`` (6,) with the fields of :class:`Margins` over the joint samples ``Q`` (S, 4); the grip's path length in mm.
 
@@ -80,7 +80,7 @@ def dense_margins(Q: Floats, scene: Scene, out: Floats) -> float:
     return length
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _around(
     cy: float, sy: float, first: int, hand: int, planar: Floats, capsules: Floats, obstacles: Floats, arm_rows: int, frames: Floats,
     ends: Floats, placed: Floats, point: Floats, out: Floats,
@@ -97,7 +97,7 @@ def _around(
                 out[field] = min(out[field], nearest(ends, k, placed, 0, point) - need)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _itself(
     first: int, carried: int, planar: Floats, capsules: Floats, pairs: Ints, clearance: Floats, frames: Floats, ends: Floats,
     point: Floats, out: Floats,

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -154,3 +158,36 @@ def test_the_arm_never_reaches_past_its_reach(model, planner):
             assert (np.hypot(ends[:, e], ends[:, e + 1]) + body.held[:, 7] <= body.reach_mm + 1e-9).all()
     far = np.array([[body.reach_mm + 30, 0, 0, body.reach_mm + 30, 0, 100, 10, 5, 50.0], [200, 0, 0, 200, 0, 100, 10, 5, 50.0]])
     assert out_of_reach(body, np.array([*far[:1] + [120, 0, 0, 120, 0, 0, 0, 0, 0], far[1]])).tolist() == [True, False]
+
+
+PLANNED = """
+from marl_handover.cell import build_cell, cell_config
+from marl_handover.motion.planner import MotionPlanner
+
+planner = MotionPlanner(build_cell(cell_config("paper")))
+for pick, place in (([-60.0, 20.0], [50.0, 25.0]), ([0.0, 30.0], [-155.0, 60.0]), ([90.0, -10.0], [-20.0, -15.0])):
+    for arm in (0, 1):
+        try:
+            motion = planner.cycle(arm, pick, place, planner.parked_rad, planner.parked_rad)
+        except Exception as refusal:
+            print(type(refusal).__name__)
+        else:
+            print([phase.joints_rad.tobytes().hex() for phase in motion.phases])
+"""
+
+
+@pytest.mark.slow
+def test_a_process_that_compiles_moves_as_one_that_finds_all_compiled(tmp_path):
+    """To the last bit. A compiler that may reorder sums does so one way where it sees a called function and another where it does not."""
+    told = [
+        subprocess.run(
+            [sys.executable, "-c", PLANNED],
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for _ in range(2)
+    ]
+    assert told[0].count("[") >= 3
+    assert told[0] == told[1]
