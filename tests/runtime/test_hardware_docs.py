@@ -45,5 +45,10 @@ def test_what_the_twin_came_to_is_what_is_stored():
     twice = json.loads((root / "bench/results/2026-11-22/twin_noise2.json").read_text(encoding="utf-8"))
     assert (twice["settings"]["noise"], twice["episodes"]["count"], twice["episodes"]["first_time"]) == (2.0, 100, 0.99)
     assert "99 of 100 were solved at the first final placement" in " ".join(TEXT.split())
+    soak = json.loads((root / "bench/results/2026-11-22/twin_soak.json").read_text(encoding="utf-8"))["soak"]
+    assert (soak["transfers"], soak["processes"]) == (5001, 1)
+    assert sum(part["episodes"] for part in soak["parts"]) == sum(part["first"] for part in soak["parts"]) == 1654
+    assert {(round(mb), part["files"]) for part in soak["parts"] for mb in part["rss_mb"]} == {(816, 12)}
+    assert "5,001 transfers in one process, 1,654 problems one after another, solved every one" in " ".join(TEXT.split())
     for text in (TEXT, (root / "README.md").read_text(encoding="utf-8")):
         assert "200 of 200 in the end" in " ".join(text.split())
