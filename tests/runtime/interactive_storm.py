@@ -119,7 +119,9 @@ def rates_limits(cell: InteractiveCell):
 
 def least_gaps_mm(cell: InteractiveCell, seen: Seen):
     """The arms' least distance from each other (n,), and the hands' from a block that nobody holds (n,), inf where a hand holds it."""
-    config, arms = cell.model.cell.config, []
+    config, arms, to_block = cell.model.cell.config, [], []
+    places = np.stack([np.append(it.block[:2], config.pick_height_mm) for it in seen.snapshots])
+    capsules = block_capsules(config.block, config.pick_height_mm)
     joints = joints_of(seen)
     for index, base in enumerate(cell.model.cell.bases):
         frames = cell.model.arm.link_transforms(joints[:, index], cell.motion.finger_travel_mm)
@@ -131,12 +133,12 @@ def least_gaps_mm(cell: InteractiveCell, seen: Seen):
             ends = [(T[..., :3, :3] @ np.array(end) + T[..., :3, 3]) @ turn.T + shift for end in (capsule.start_mm, capsule.end_mm)]
             shapes.append((*ends, capsule.radius_mm))
         arms.append(shapes)
-    places = np.stack([np.append(it.block[:2], config.pick_height_mm) for it in seen.snapshots])
-    block = [(places + it.start_mm, places + it.end_mm, it.radius_mm) for it in block_capsules(config.block, config.pick_height_mm)]
+        # Capsules that cover the block however it is turned: they lie as the arm sees them, and are no disc.
+        block = [(places + turn @ it.start_mm, places + turn @ it.end_mm, it.radius_mm) for it in capsules]
+        to_block.append(_least(shapes, block))
     between = _least(*arms)
-    to_block = np.minimum(*(_least(arm, block) for arm in arms))
     held = np.array([it.T_world_block[2, 3] > 1e-6 or it.phase in (*HELD, "grasp", "release") for it in seen.snapshots])
-    return between, np.where(held, np.inf, to_block)
+    return between, np.where(held, np.inf, np.minimum(*to_block))
 
 
 def _least(ones, others):
