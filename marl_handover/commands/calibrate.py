@@ -145,7 +145,7 @@ def _servos(config: CalibrateCommand, plugs: Plugs, assistant: Assistant, model:
 
 def _grippers(config: CalibrateCommand, model: CellModel) -> None:
     from marl_handover.motion.planner import MotionPlanner
-    from marl_handover.runtime.gripper_calibration import PLACES, Grip, GripperCalibration
+    from marl_handover.runtime.gripper_calibration import Grip, GripperCalibration, places
     from marl_handover.runtime.gripper_file import save_grippers
     from marl_handover.runtime.hardware_backend import HardwareBackend
 
@@ -155,8 +155,9 @@ def _grippers(config: CalibrateCommand, model: CellModel) -> None:
     found: dict[str, Grip] = {}
     try:
         assistant: Assistant = backend.lab.twin or Person(config.cards)
-        assistant.stand_block(PLACES[0])
-        backend.reset(np.array(PLACES[0]), config.seed)
+        first = places(model.cell)[0]
+        assistant.stand_block(first)
+        backend.reset(np.array(first), config.seed)
         procedure = GripperCalibration(backend, planner, assistant, _told)
         for arm, name in enumerate(ARMS):
             found[name] = grip = procedure.arm(arm)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.cell import Cell
 from marl_handover.hardware.calibration import CalibrationProblem
 from marl_handover.hardware.settings import ARMS, GripperConfig
 from marl_handover.motion.planner import MotionPlanner
@@ -27,11 +28,16 @@ RANGE_MM = 1.6
 """How far the settings may be off, either way, for each finger."""
 
 STEP_MM = 0.2
-SURE_MM = 0.3
+SURE_MM = 0.5
 """So much further than where the block was first carried: that grip may have been a lucky one."""
 
-PLACES = ((0.0, -25.0, 0.0), (0.0, 25.0, 0.0))
-"""Between these, x_mm, y_mm, theta_rad, the block is carried; both arms reach them."""
+_ALPHA = 0.7
+"""Far apart: over a short way a hand lifts little, and fingers that are not closed drag the block along by its pin."""
+
+
+def places(cell: Cell) -> tuple[tuple[float, float, float], ...]:
+    """Between these, x_mm, y_mm, theta_rad, the block is carried; both arms of ``cell`` reach them."""
+    return tuple((float(x), float(y), 0.0) for x, y in cell.chart.to_table(np.array([-_ALPHA, _ALPHA]), np.zeros(2)))
 
 
 class Grip(NamedTuple):
@@ -60,6 +66,7 @@ class GripperCalibration:
         progress: Callable[[int, float, bool], object] = lambda arm, further_mm, held: None,
     ) -> None:
         self.backend, self.planner, self.assistant, self.progress = backend, planner, assistant, progress
+        self.places = places(backend.model.cell)
 
     def arm(self, arm: int) -> Grip:
         """Calibrate one hand; the cell goes on with what was found.
@@ -91,7 +98,7 @@ class GripperCalibration:
     def _carries(self, arm: int) -> bool:
         """Whether the hand, as it is set now, takes the block to the other place."""
         pose = self._block()
-        place = max((np.asarray(place[:2]) for place in PLACES), key=lambda place: math.dist(place, pose[:2]))
+        place = max((np.asarray(place[:2]) for place in self.places), key=lambda place: math.dist(place, pose[:2]))
         joints = self.backend.joints_rad()
         motion = self.planner.cycle(arm, pose[:2], place, joints[arm], np.delete(joints, arm, axis=0)[0])
         refusal = self.backend.execute(arm, motion.paths).refusal
@@ -107,5 +114,5 @@ class GripperCalibration:
             pose = None
         if pose is not None and bool(self.backend.model.cell.reaches(pose[:2]).all()):
             return pose
-        self.assistant.stand_block(PLACES[0])
-        return self.backend.reset(np.asarray(PLACES[0]), 0)
+        self.assistant.stand_block(self.places[0])
+        return self.backend.reset(np.asarray(self.places[0]), 0)

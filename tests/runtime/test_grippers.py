@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from marl_handover.errors import CorruptFile, InvalidSetting
 from marl_handover.hardware.calibration import CalibrationProblem
 from marl_handover.hardware.settings import ARMS, GripperConfig
 from marl_handover.hardware.wiring import gripper_pulse_us
-from marl_handover.runtime.gripper_calibration import PLACES, RANGE_MM, GripperCalibration
+from marl_handover.runtime.gripper_calibration import RANGE_MM, GripperCalibration, places
 from marl_handover.runtime.gripper_file import FILE, save_grippers, shifted, with_grippers
 from marl_handover.runtime.hardware_backend import HardwareBackend
 from marl_handover.runtime.settings import WatchConfig, twin_lab
@@ -42,8 +43,9 @@ def hands(twin_calibration, tmp_path, model, planner):
             at_mm = servo.position
             servo.truth = replace(servo.truth, zero_us=GripperConfig().closed_us + off_us)
             servo.put(at_mm)
-        twin.stand_block(PLACES[0])
-        backend.reset(np.array(PLACES[0]), 0)
+        first = places(model.cell)[0]
+        twin.stand_block(first)
+        backend.reset(np.array(first), 0)
         return GripperCalibration(backend, planner, twin)
 
     yield make
@@ -64,6 +66,12 @@ def test_the_hand_is_found_that_holds_and_does_not_press_harder_than_it_must(han
     assert np.all(np.diff([further for further, _ in told]) > 0), "never closed further than it needed"
     assert procedure.backend.lab.driver.config.arms["right"].gripper == grip.gripper, "goes on with it"
     assert procedure.backend.lab.config.hardware.arms["right"].gripper == GripperConfig(channel=20), "settings are the user's"
+
+
+def test_both_arms_reach_the_places_in_every_cell(cell):
+    first, second = places(cell)
+    assert cell.reaches(np.array([first[:2], second[:2]])).all()
+    assert math.dist(first[:2], second[:2]) / 2 > 2 * MotionConfig().lift_scale_mm, "lifted wholly from wherever a block was dragged to"
 
 
 def test_settings_that_are_far_off_are_told_and_not_worked_around(hands):
