@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +19,15 @@ from marl_handover.hardware.settings import ArmWiring, BoardConfig, GripperConfi
 from marl_handover.motion.planner import MotionPlanner
 
 PARKED = np.radians(MotionConfig().parked_deg)
+
+
+@pytest.fixture(autouse=True)
+def _no_handler_of_others():
+    """Ray, once used in this process, leaves a handler of SIGTERM behind, and a session leaves those alone."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

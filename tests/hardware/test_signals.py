@@ -14,15 +14,6 @@ from marl_handover.hardware.signals import Endings, deferred
 ENDINGS = (signal.SIGTERM, signal.SIGHUP)
 
 
-@pytest.fixture(autouse=True)
-def _usual_handlers():
-    """Python's own: other libraries leave theirs in a process that has run their tests."""
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in ENDINGS}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
 def handlers():
     return [signal.getsignal(number) for number in (signal.SIGINT, *ENDINGS)]
 
