@@ -67,7 +67,7 @@ def run(config: CalibrateCommand) -> int:
         config.target.validate()
         config.cards.validate(config.target)
         return _sheets(config, model)
-    if config.what != "grippers":
+    if config.what in ("all", "camera", "servos"):
         plugs = plug_in(config, model, config.motion, confirmed)
         try:
             assistant: Assistant = plugs.twin or Person(config.cards)

@@ -96,10 +96,16 @@ def open_study(storage: str, name: str, pruner: optuna.pruners.BasePruner | None
 
 
 def asked(study: Study, storage: str, folder: Path) -> Trial:
-    """The next trial. SQLite locks no rows: without the lock beside ``folder`` two processes may be given the same queued one."""
+    """The next trial. SQLite locks no rows: without the lock beside ``folder`` two processes may be given the same queued one.
+
+    Raises:
+        StorageUnavailable: others kept the lock for too long.
+    """
     if not storage.startswith("sqlite"):
         return study.ask()
-    with held(folder / "ask", wait_s=SQLITE_WAIT_S):
+    with held(folder / "ask", wait_s=SQLITE_WAIT_S) as mine:
+        if not mine:
+            raise StorageUnavailable(storage, f"is asked by another process for more than {SQLITE_WAIT_S:g} s")
         return study.ask()
 
 

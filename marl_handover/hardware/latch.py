@@ -8,6 +8,7 @@ import os
 import time
 from pathlib import Path
 
+from marl_handover.files import temporary_of
 from marl_handover.hardware.roll import Roll
 
 
@@ -43,7 +44,7 @@ class StopLatch:
         self._here = reason or "stop"
         self._forget_receipts()
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")  # not fsynced: that may take longer than a stop has
+        temporary = temporary_of(self.path)  # not fsynced: that may take longer than a stop has
         temporary.write_text(json.dumps({"reason": self._here, "pid": os.getpid(), "time": time.time()}), encoding="utf-8")
         temporary.replace(self.path)
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from marl_handover.errors import InvalidSetting
+from marl_handover.files import temporary_of
 from marl_handover.hardware.clock import Clock, RealClock
 from marl_handover.hardware.emulator.device import Device
 
@@ -89,7 +90,7 @@ class PtyEmulator:
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
-        temporary = self.link.with_name(f"{self.link.name}.{os.getpid()}.tmp")
+        temporary = temporary_of(self.link)
         try:
             self.link.parent.mkdir(parents=True, exist_ok=True)
             temporary.unlink(missing_ok=True)
