@@ -356,6 +356,6 @@ def test_the_howtos_code_runs(capsys):
     assert [sum(int(line.split()[index]) for line in lines) for index in (0, 2)] == [100, 50]
 
 
-@pytest.mark.parametrize("line", re.findall(r"^ +marl-handover train (.*)", TEXT, re.MULTILINE))
+@pytest.mark.parametrize("line", re.findall(r"^ *marl-handover train (.*)", TEXT, re.MULTILINE))
 def test_the_howtos_commands_are_ones(line):
     compose(train.SCHEMA, shlex.split(line), groups=train.GROUPS, aliases=train.ALIASES).validate()
