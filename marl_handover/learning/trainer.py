@@ -17,6 +17,7 @@ from torch import Tensor
 from marl_handover.compose import to_yaml
 from marl_handover.errors import CheckpointMismatch, CorruptFile, InvalidSetting
 from marl_handover.files import write_whole
+from marl_handover.learning.algorithm import subnormals_flushed
 from marl_handover.learning.algorithm_settings import OffPolicyConfig, PpoConfig
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
 from marl_handover.learning.curriculum import Curriculum
@@ -112,11 +113,12 @@ class Trainer:
         self.recent += collected.ended
         self.counters.episodes += int(collected.ended[0])
         self._schedule()
-        if isinstance(config, OffPolicyConfig):
-            self._learn_from_replay(collected, config)
-        elif isinstance(config, PpoConfig):
-            assert collected.transition is not None
-            self._learn_from_rollout(collected.transition, config)
+        with subnormals_flushed():
+            if isinstance(config, OffPolicyConfig):
+                self._learn_from_replay(collected, config)
+            elif isinstance(config, PpoConfig):
+                assert collected.transition is not None
+                self._learn_from_rollout(collected.transition, config)
 
     def _schedule(self) -> None:
         self.algorithm.schedule(min(1.0, self.counters.step / self.config.steps))
