@@ -25,7 +25,7 @@ def test_the_pretrained_policy_of_the_example_succeeds(capsys):
     assert "success after" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("run", ["b0", "b1", "b2", "e1", "a0", "pretrained_a", "pretrained_b"])
+@pytest.mark.parametrize("run", ["b0", "b1", "b2", "f0", "f1", "f2", "e1", "a0", "pretrained_a", "pretrained_b"])
 def test_the_result_table_says_what_the_runs_say(run):
     result = json.loads((RESULTS / run / "evaluation.json").read_text())
     summary = json.loads((RESULTS / run / "summary.json").read_text())
@@ -40,6 +40,18 @@ def test_the_result_table_says_what_the_runs_say(run):
         and f"{summary['wall_s']:.0f}" in row
     ]
     assert len(rows) == 1
+
+
+def test_the_page_on_learning_says_what_one_accuracy_alone_is_worth():
+    names = ("evaluation.json", "evaluation_3deg.json", "evaluation_1deg.json")
+    runs = [json.loads((RESULTS / "f0" / name).read_text()) for name in names]
+    assert [run["epsilon_deg"] for run in runs] == [5.0, 3.0, 1.0]
+    five, three, one = (f"{100 * run['success_rate']:.2f} %" for run in runs)
+    for said in (f"seed 0 solves {five} after a quarter", f"and {three} judged at 3°, but {one} at 1°"):
+        assert said in LEARNING
+    fixed = json.loads((RESULTS / "fixed_1deg" / "evaluation.json").read_text())
+    steps = json.loads((RESULTS / "fixed_1deg" / "summary.json").read_text())["step"]
+    assert f"at 1° alone, {steps:,} transfers led to {100 * fixed['success_rate']:.2f} %" in LEARNING
 
 
 def words(spread, *forms):
