@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import re
 from pathlib import Path
 
@@ -15,6 +17,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
 BLOCKS = blocks(PAGE)
 EVIDENCE = read_evidence(ROOT / "bench" / "results" / "compare")
+SINGLE = ROOT / "bench" / "results" / "2026-11-22"
+"""Runs outside the suites."""
 SUITES = sorted(path.stem for path in suite_folder().glob("*.yaml"))
 
 
@@ -90,3 +94,21 @@ def test_evidence_names_settings_seeds_and_commits(suite):
             assert parts
             assert all(part["commit"] != "none" and part["machine"]["cpu"] for part in parts)
         assert (row["config_hash"] is None) == (row["settings"] is None)
+
+
+def test_what_the_page_says_of_single_runs_is_what_they_say():
+    said = " ".join(PAGE.split())
+    random = json.loads((SINGLE / "random_a_30deg.json").read_text())
+    assert (random["policy"], random["architecture"], random["epsilon_deg"]) == ("random", "A", 30.0)
+    assert f"even with 30° it takes {random['mean_steps']:.1f} " in said
+    raw = json.loads((SINGLE / "dqn_raw" / "evaluation.json").read_text())
+    steps = json.loads((SINGLE / "dqn_raw" / "summary.json").read_text())["step"]
+    assert f"Without both it solves {100 * raw['success_rate']:.2f} % after {steps:,} transfers (one seed)" in said
+    solved = []
+    for seed in range(3):
+        with open(SINGLE / "paper_b_training" / f"seed{seed}.csv", newline="", encoding="utf-8") as lines:
+            solved += [float(row["training_success_rate"]) for row in csv.DictReader(lines) if row["step"] == "150000"]
+    assert f"the same runs solve {100 * min(solved):.0f} to {100 * max(solved):.0f} % after 150,000 transfers" in said
+    second = [json.loads((SINGLE / "twin_second" / f"ours_{name}.json").read_text()) for name in "ba"]
+    of_50 = [f"{round(50 * report['success_rate'])} of 50" for report in second]
+    assert f"a second run of ours, left out of the table: {of_50[0]} in B, {of_50[1]} in A" in said
