@@ -145,7 +145,8 @@ def subnormals_flushed() -> Iterator[None]:
     """Within, numbers too small to be normal are 0 on this thread's processor.
 
     The moments Adam keeps of a unit that never fires decay into that range, where every operation is many times slower: of the paper's
-    networks half the numbers get there, and a gradient step costs a fifth more.
+    networks half the numbers get there, and a gradient step costs a fifth more. Afterwards they are kept, as is torch's default;
+    what was set before cannot be asked.
     """
     torch.set_flush_denormal(True)
     try:
