@@ -54,6 +54,19 @@ def test_the_page_on_learning_says_what_one_accuracy_alone_is_worth():
     assert f"at 1° alone, {steps:,} transfers led to {100 * fixed['success_rate']:.2f} %" in LEARNING
 
 
+def test_the_summary_of_the_papers_suite_says_what_the_suite_says():
+    rows = json.loads((RESULTS.parent / "compare" / "paper" / "results.json").read_text())["rows"]
+    found = {row["name"]: row["evaluations"]["kinematic"] for row in rows}
+    rate = {name: 100 * judged["success_rate"]["value"] for name, judged in found.items()}
+    more = 100 * (found["dqn_b"]["steps_ratio"]["value"] - 1)
+    for said in (
+        f"{rate['ours_b']:.2f} % in B and {rate['ours_a']:.2f} % in A",
+        f"{rate['paper_b']:.0f} – {rate['paper_b_fixed']:.0f} % in B",
+        f"{rate['dqn_b']:.2f} % with {more:.0f} % more transfers",
+    ):
+        assert said in TEXT
+
+
 def words(spread, *forms):
     """A spread's median, 95th percentile and worst as a row of the table has them."""
     return " | ".join(form.format(spread[key]) for key, form in zip(("median", "p95", "worst"), forms, strict=True))
