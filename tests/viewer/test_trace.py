@@ -81,9 +81,12 @@ def test_a_viewer_plays_the_trace_to_its_end_and_jumps_to_an_episode(server, pag
     with Client(address(server)) as viewer:
         viewer.wait(lambda: len(server.get_clients()) == 1, 10)
         viewer.set("play", True)
+        viewer.wait(lambda: page._playing, 10)
         seen = set()
-        for _ in range(20_000):
+        for _ in range(2_000):
             page.update(0.1)
+            if page._moving is not None:
+                page._moving.result(60)  # planned in another thread, for which the page does not wait but this test must
             seen.add(tuple(np.round(shown(server)[:2], 3)))
             if page._number == page.trace.moments - 1 and page._play.label == "play":
                 break
