@@ -21,8 +21,8 @@ LINE_IN, HEAD_IN, PANEL_IN, LABEL_IN = 0.3, 1.35, 3.1, 0.075
 LEGEND_LINE_IN = 0.17
 
 MEASURES = {
-    "success_rate": ("success", 100.0, "{:.1f} %"),
-    "success_in_the_end": ("success in the end", 100.0, "{:.1f} %"),
+    "success_rate": ("success", 100.0, "{:.2f} %"),
+    "success_in_the_end": ("success in the end", 100.0, "{:.2f} %"),
     "mean_steps": ("mean transfers an episode", 1.0, "{:.2f}"),
     "mean_steps_success": ("mean transfers, solved episodes", 1.0, "{:.2f}"),
     "steps_ratio": ("transfers ÷ optimum, solved episodes", 1.0, "{:.3f}"),

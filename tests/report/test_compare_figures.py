@@ -124,7 +124,7 @@ def test_a_bar_is_the_stored_value_with_its_interval_and_runs():
         found = item["evaluations"]["kinematic"]["success_rate"]
         bar = axes.patches[line]
         assert bar.get_width() == pytest.approx(100 * found["value"])
-        assert f"{100 * found['value']:.1f} %" in [text.get_text() for text in axes.texts]
+        assert f"{100 * found['value']:.2f} %" in [text.get_text() for text in axes.texts]
     dots = sorted(value for line in axes.lines if line.get_marker() == "o" for value in line.get_xdata())
     runs = sorted(100 * run["evaluations"]["kinematic"]["success_rate"] for item in FEW["rows"] for run in item["runs"])
     np.testing.assert_allclose(dots, runs)
