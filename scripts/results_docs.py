@@ -9,6 +9,7 @@ from pathlib import Path
 
 from marl_handover.compare.docs import filled, read_evidence, store_evidence
 from marl_handover.errors import HandoverError
+from marl_handover.files import write_whole
 
 ROOT = Path(__file__).resolve().parents[1]
 EVIDENCE, PAGE, PICTURES = ROOT / "bench" / "results" / "compare", ROOT / "docs" / "results.md", "../bench/results/compare"
@@ -18,7 +19,7 @@ if __name__ == "__main__":
     try:
         for out in (argument for argument in sys.argv[1:] if argument != PARTIAL):
             print(f"stored: {store_evidence(Path(out), EVIDENCE, partial=PARTIAL in sys.argv[1:])}")
+        write_whole(PAGE, filled(PAGE.read_text(encoding="utf-8"), read_evidence(EVIDENCE), PICTURES))
     except HandoverError as error:
         sys.exit(str(error))
-    PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), read_evidence(EVIDENCE), PICTURES), encoding="utf-8")
     print(f"written: {PAGE}")

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from marl_handover.config import require_at_least, require_choice
 from marl_handover.errors import InvalidSetting, UnknownChoice, WorkFailed
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ class CompareConfig:
     suite: str = "paper"  # paper, variants, ablations, or a YAML file
     preset: str = "full"  # full or quick, a smoke size
     rows: list[str] = field(default_factory=list)  # some of its rows; []: all
-    seeds: int = 0  # of every row; 0: as the suite has it
+    seeds: int = 0  # of every row; 0: as the suite has it; an evaluation that the suite gives fewer keeps to those
     out: str = ""  # folder of runs and results, shared by all machines; runs/compare/<suite>, with -quick
     fresh: list[str] = field(default_factory=list)  # rows, or row/evaluation, whose results are thrown away and made anew
     report_only: bool = False  # run nothing: tables and figures of what is there
@@ -70,6 +71,8 @@ def run(config: CompareConfig) -> int:
 
 def _check(config: CompareConfig, suite: Suite) -> None:
     """Refuse keys that name nothing, or that nothing would look at."""
+    from marl_handover.compare.launch import LAUNCHERS
+
     known = [row.name for row in suite.rows]
     for row in suite.rows:
         specs = [spec for seed in suite.seeds_of(row) for spec in suite.evaluations_of(row, seed)]
@@ -79,6 +82,8 @@ def _check(config: CompareConfig, suite: Suite) -> None:
             raise UnknownChoice("fresh", name, known)
     if config.report_only and config.fresh:
         raise InvalidSetting("fresh", config.fresh, "left out with report_only=true, which makes nothing anew")
+    require_choice("launcher", config.launcher, LAUNCHERS)
+    require_at_least("jobs", config.jobs, 0)
     if config.address and config.launcher == "loky":
         raise InvalidSetting("address", config.address, "left out with launcher=loky; it is that of a Ray cluster")
 
@@ -112,15 +117,17 @@ def _calibrate_twin(tasks: Sequence[Task]) -> None:
 def _run_tasks(config: CompareConfig, tasks: Sequence[Task]) -> tuple[dict[str, str], list[str]]:
     """Run what is not finished; name and reason of what failed, and names of what another call is at."""
     from marl_handover.compare.launch import Failure, fan_out
-    from marl_handover.compare.runs import clear_all, execute, finished
+    from marl_handover.compare.runs import clear_all, execute, finished, is_named
 
-    clear_all(tasks, config.fresh)
-    todo = [task for task in tasks if not finished(task)]
+    # In the order of their seeds, so that what is there after half of the time compares all rows.
+    todo = sorted((task for task in tasks if not finished(task) or is_named(task, config.fresh)), key=lambda task: task.seed)
     if len(todo) < len(tasks):
         print(f"{len(tasks) - len(todo)} of {len(tasks)} runs are done already", file=sys.stderr)
     _calibrate_twin(todo)
     failures, others = {}, []
     options: dict[str, Any] = {"launcher": config.launcher, "address": config.address, "jobs": config.jobs, "progress": config.progress}
+    # Nothing is thrown away before there is somebody who can make it anew.
+    options["ready"] = lambda: clear_all(todo, config.fresh)
     for task, result in fan_out(execute, todo, label=lambda task: task.name, **options):
         if isinstance(result, Failure):
             failures[task.name] = result.error

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from marl_handover.commands import train
 from marl_handover.config import require_at_least, require_choice
 from marl_handover.errors import InvalidSetting
+from marl_handover.files import write_whole
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.resources import resource_path
 
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
     from optuna.study import Study
 
     from marl_handover.compare.tune import Note, Search
+
+
+STUDY_FILE = "study.txt"
+"""In the folder of a study: its name. Trials are numbered, so that a folder holds those of one study only."""
 
 
 @dataclass
@@ -52,6 +57,8 @@ def run(config: TuneConfig) -> int:
 
     search, out = _search(config)
     study, left = prepare(search)
+    out.mkdir(parents=True, exist_ok=True)
+    write_whole(out / STUDY_FILE, search.study + "\n")
     if config.progress:
         print(f"study {search.study}: {search.trials - left} of {search.trials} trials are done", file=sys.stderr)
     notes: list[Note] = []
@@ -86,6 +93,8 @@ def _search(config: TuneConfig) -> tuple[Search, Path]:
     out = Path(config.out or f"runs/tune/{name}")
     if out.exists() and not out.is_dir():
         raise InvalidSetting("out", str(out), "a folder; this is a file")
+    if (out / STUDY_FILE).is_file() and (owner := (out / STUDY_FILE).read_text(encoding="utf-8").strip()) != name:
+        raise InvalidSetting("out", str(out), f"a folder for study {name}; this one has the trials of study {owner}")
     origin = option_file("search", config.search or config.algorithm.name, resource_path("configs") / "search", None)
     space = load_space(origin, settings, config.fixed)
     storage = located(config.storage, out)
@@ -103,7 +112,6 @@ def _report(search: Search, study: Study, out: Path, notes: list[Note]) -> None:
     from marl_handover.compare.tune import require_result
     from marl_handover.compare.tune_report import arguments, best_settings, write_preset, write_trials
 
-    out.mkdir(parents=True, exist_ok=True)
     write_trials(study, search, out / "trials.csv")
     require_result(study, notes)
     settings = best_settings(study, search)

@@ -56,6 +56,7 @@ def fan_out(
     attempts: int = 3,
     label: Callable[[Item], str] = str,
     progress: bool = True,
+    ready: Callable[[], None] = lambda: None,
 ) -> Generator[tuple[Item, Result | Failure], None, None]:
     """Pairs of item and result in the order in which they are done; each item has exactly one.
 
@@ -73,6 +74,7 @@ def fan_out(
         attempts: how often an item is started at most when workers die.
         label: an item's name in messages.
         progress: show a bar.
+        ready: called once, when workers can be had and before any item is given to one.
 
     Raises:
         UnknownChoice, InvalidSetting: for arguments out of their limits.
@@ -88,9 +90,9 @@ def fan_out(
     if launcher == "ray":
         from marl_handover.compare.ray_workers import through_ray
 
-        outcomes = through_ray(dict(enumerate(parcels)), names, address, jobs, attempts)
+        outcomes = through_ray(dict(enumerate(parcels)), names, address, jobs, attempts, ready)
     else:
-        outcomes = _through_loky(parcels, names, jobs or cpu_count(), attempts)
+        outcomes = _through_loky(parcels, names, jobs or cpu_count(), attempts, ready)
     return _delivered(items, names, outcomes, progress)
 
 
@@ -110,11 +112,14 @@ def _delivered(
                 yield item, cloudpickle.loads(outcome.payload)
 
 
-def _through_loky(parcels: list[bytes], names: list[str], workers: int, attempts: int) -> Generator[Outcome, None, None]:
+def _through_loky(
+    parcels: list[bytes], names: list[str], workers: int, attempts: int, ready: Callable[[], None]
+) -> Generator[Outcome, None, None]:
     """Rounds of joblib's loky workers. When one of them dies, all do, and what is unfinished goes into the next round.
 
     Which of the items that ran at that time is to blame cannot be told, so before one of them is given up it runs alone.
     """
+    ready()
     waiting = dict(enumerate(parcels))
     deaths: Counter[int] = Counter()
     while waiting:

@@ -14,7 +14,7 @@ from marl_handover.compare.suite import EVALUATION_SEED_OFFSET, RowSpec, Suite
 from marl_handover.compare.suite_check import RUN
 from marl_handover.compose import compose
 from marl_handover.compose_schema import Groups
-from marl_handover.errors import HandoverError
+from marl_handover.errors import HandoverError, InvalidSetting, UnknownChoice
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.policies.registry import NAMES
 from marl_handover.policies.shielded import SHIELDED
@@ -68,7 +68,9 @@ def _row_tasks(suite: Suite, row: RowSpec, out: Path, train: Grammar, evaluate: 
     asked = {}
     for spec in suite.evaluations_of(row, 0):
         wanted = tuple(suite.evaluate_arguments(row, spec))
-        asked[spec.name] = Judgement(spec.name, _composed(AssessmentConfig, wanted, evaluate), wanted, suite.policy_of(row, spec))
+        judged = _composed(AssessmentConfig, wanted, evaluate)
+        _check_fits(spec.name, judged, config, suite.policy_of(row, spec))
+        asked[spec.name] = Judgement(spec.name, judged, wanted, suite.policy_of(row, spec))
     tasks = []
     for seed in suite.seeds_of(row):
         folder = out / row.name / f"seed{seed}"
@@ -83,11 +85,27 @@ def _row_tasks(suite: Suite, row: RowSpec, out: Path, train: Grammar, evaluate: 
     return tasks
 
 
+def _check_fits(name: str, judged: AssessmentConfig, trained: TrainConfig | None, policy: str) -> None:
+    """Refuse what an evaluation of a trained row would find out after the training. Raises :class:`InvalidSetting`."""
+    if trained is None or RUN not in policy:
+        return
+    architecture = judged.task.architecture
+    if architecture not in (None, trained.task.architecture):
+        raise InvalidSetting(f"{name}: task.architecture", architecture, f"{trained.task.architecture}, which the row is trained for")
+    if trained.variant == "centralised" and judged.backend != "kinematic":
+        raise InvalidSetting(f"{name}: backend", judged.backend, "kinematic for variant=centralised, whose motions are its own")
+
+
 def _placed(policy: str) -> str:
     """A policy's name, its path absolute if it is one."""
     if policy.startswith(SHIELDED):
         return SHIELDED + _placed(policy.removeprefix(SHIELDED))
-    return policy if policy in NAMES else str(Path(policy).expanduser().absolute())
+    if policy in NAMES:
+        return policy
+    path = Path(policy).expanduser()
+    if path.parent == Path() and path.suffix != ".npz" and not path.exists():
+        raise UnknownChoice("policy", policy, (*NAMES, f"{SHIELDED}NAME", "a run directory", "a policy file (.npz)"))
+    return str(path.absolute())
 
 
 def _composed(schema: type[Config], arguments: Sequence[str], grammar: Grammar) -> Config:

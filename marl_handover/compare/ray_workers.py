@@ -12,7 +12,7 @@ import importlib
 import logging
 import os
 import socket
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from typing import Any
@@ -46,7 +46,9 @@ def require_ray() -> Any:
         raise MissingExtra("launcher=ray", "ray", "ray") from error
 
 
-def through_ray(parcels: Mapping[int, bytes], names: list[str], address: str, jobs: int, attempts: int) -> Generator[Outcome, None, None]:
+def through_ray(
+    parcels: Mapping[int, bytes], names: list[str], address: str, jobs: int, attempts: int, ready: Callable[[], None]
+) -> Generator[Outcome, None, None]:
     """The outcome of each parcel as it is done, on the cluster at ``address``; see :func:`marl_handover.compare.launch.fan_out`."""
     if not parcels:
         return
@@ -54,6 +56,7 @@ def through_ray(parcels: Mapping[int, bytes], names: list[str], address: str, jo
         cores = int(ray.cluster_resources().get("CPU", 0))
         if not cores:
             raise ClusterUnavailable(address, "it has no cores")
+        ready()
         backend = RayTasks(ray, names, attempts)
         at_once = jobs or cores
         # With a single worker joblib would do the work in this process.

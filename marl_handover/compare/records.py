@@ -7,13 +7,16 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from marl_handover.errors import HandoverError
 from marl_handover.files import write_whole
 from marl_handover.learning.settings import TrainConfig
+from marl_handover.policies.registry import content_hash
 from marl_handover.resources import package_path
 from marl_handover.runtime.assessment import AssessmentConfig
 from marl_handover.task.rules import Outcome
@@ -64,6 +67,41 @@ def usual_settings(config: TrainConfig | AssessmentConfig) -> Settings:
     if isinstance(config, TrainConfig) and isinstance(usual, TrainConfig):
         usual.algorithm = type(config.algorithm)()
     return settings_of(usual)
+
+
+def differences(stored: Settings, config: TrainConfig | AssessmentConfig) -> Iterator[tuple[str, Any, Any]]:
+    """Key, stored value and present value of each setting in which ``config`` is not what was stored.
+
+    A setting that is younger than the record had its default. One that is gone from the schema says nothing, but one of a section that is
+    left out now was taken back.
+    """
+    usual, now = usual_settings(config), settings_of(config)
+    for key, value in now.items():
+        before = stored.get(key, usual.get(key))
+        if before != value:
+            yield key, before, value
+    for key, before in stored.items():
+        parts = key.split(".")
+        sections = {".".join(parts[:count]) for count in range(1, len(parts))}
+        if any(section in now and now[section] is None for section in sections):
+            yield key, before, None
+
+
+def contents_of(config: AssessmentConfig, own_run: bool) -> dict[str, str]:
+    """Short hashes of the files that an evaluation reads, by the setting that names them; what cannot be read is left out.
+
+    Args:
+        config: of the evaluation.
+        own_run: whether its policy is what the same task trained, which its own record is about.
+    """
+    found: dict[str, str] = {}
+    with suppress(HandoverError):
+        if not own_run and (digest := content_hash(config.policy)):
+            found["policy"] = digest
+    with suppress(OSError):
+        if config.problems:
+            found["problems"] = hashlib.sha256(Path(config.problems).read_bytes()).hexdigest()[:12]
+    return found
 
 
 def read_record(path: Path, needed: Needed | None = None) -> dict[str, Any] | None:

@@ -13,18 +13,20 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from marl_handover.compare import records
+from marl_handover.compare import records, suite_check
 from marl_handover.compare.locks import held
 from marl_handover.compare.records import fingerprint, read_record, settings_of, write_record
 from marl_handover.errors import HandoverError, WorkFailed
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.runtime.assessment import AssessmentConfig
+from marl_handover.runtime.settings import twin_lab
 
-ASKED, TRAINED, DONE, RUN_FOLDER = "task.json", "trained.json", "done.json", "run"
+ASKED, TRAINED, DONE = (f"{name}.json" for name in suite_check.RECORDS)
+RUN_FOLDER = "run"
 
 GRACE_S = 20.0
 """So long a task waits for its lock: a worker whose machine has left the cluster may live on for some seconds."""
@@ -32,12 +34,23 @@ GRACE_S = 20.0
 
 @dataclass(frozen=True)
 class Judgement:
-    """One evaluation of a task. ``policy`` is as the suite has it, with ``{run}`` for the run directory."""
+    """One evaluation of a task. ``policy`` is as the suite has it, with ``{run}`` for the run directory; ``base`` is where paths start."""
 
     name: str
     config: AssessmentConfig
     arguments: tuple[str, ...]
     policy: str
+    base: Path = field(default_factory=Path.cwd)
+
+    def placed(self) -> AssessmentConfig:
+        """The settings with absolute paths: a worker may stand in another folder."""
+        problems = self.config.problems and str(self.base / Path(self.config.problems).expanduser())
+        folder = self.config.calibration or (str(twin_lab().folder()) if self.config.backend == "twin" else None)
+        return replace(self.config, problems=problems, calibration=folder and str(self.base / Path(folder).expanduser()))
+
+    def contents(self) -> dict[str, str]:
+        """Hashes of the files that it reads, see :func:`marl_handover.compare.records.contents_of`."""
+        return records.contents_of(self.placed(), own_run=suite_check.RUN in self.policy)
 
 
 @dataclass(frozen=True)
@@ -102,6 +115,10 @@ def check_unchanged(task: Task, fresh: Sequence[str] = ()) -> None:
             if about["policy"] != judgement.policy:
                 raise ChangedRow(path, f"evaluation {name}", "policy", about["policy"], judgement.policy, name)
             _compare(path, about["settings"], judgement.config, f"evaluation {name}", name)
+            stored, now = about.get("contents", {}), judgement.contents()
+            for key in sorted(stored.keys() & now.keys()):
+                if stored[key] != now[key]:
+                    raise ChangedRow(path, f"evaluation {name}", f"content of {key}", stored[key], now[key], name)
 
 
 def _compare_training(task: Task, config: TrainConfig) -> None:
@@ -114,17 +131,19 @@ def _compare_training(task: Task, config: TrainConfig) -> None:
             raise ChangedRow(task.folder / TRAINED, f"row {task.row}", "config_hash", trained["config_hash"], now, task.row)
 
 
-def _compare(path: Path, stored: Mapping[str, Any], config: TrainConfig | AssessmentConfig, what: str, fresh: str) -> None:
-    usual = records.usual_settings(config)
-    for key, value in settings_of(config).items():
-        before = stored.get(key, usual.get(key))
-        if before != value:
-            raise ChangedRow(path, what, key, before, value, fresh)
+def _compare(path: Path, stored: records.Settings, config: TrainConfig | AssessmentConfig, what: str, fresh: str) -> None:
+    for key, before, now in records.differences(stored, config):
+        raise ChangedRow(path, what, key, before, now, fresh)
+
+
+def is_named(task: Task, fresh: Sequence[str]) -> bool:
+    """Whether ``fresh`` names the task's row, or one of its evaluations."""
+    return task.row in fresh or any(f"{task.row}/{judgement.name}" in fresh for judgement in task.judgements)
 
 
 def clear_all(tasks: Sequence[Task], fresh: Sequence[str]) -> None:
     """Throw away what ``fresh`` names of the tasks. Raises :class:`Busy`, before anything is, if another call is at one of them."""
-    named = [task for task in tasks if any(name.partition("/")[0] == task.row for name in fresh)]
+    named = [task for task in tasks if is_named(task, fresh)]
     with ExitStack() as locks:
         for task in named:
             if not locks.enter_context(held(task.folder)):
@@ -211,9 +230,12 @@ def _judge(task: Task, judgement: Judgement, here: Mapping[str, Any]) -> None:
     from marl_handover.runtime.assessment import assess
 
     settings = settings_of(judgement.config)
-    report = assess(judgement.config).report
+    contents = judgement.contents()
+    report = assess(judgement.placed()).report
+    if report.pop("calibration", None) and judgement.config.calibration:
+        report["calibration"] = judgement.config.calibration  # as asked for, not where it is on this machine
     about = {"policy": judgement.policy, "arguments": list(judgement.arguments), "config_hash": fingerprint(settings), "settings": settings}
-    write_record(task.folder / f"{judgement.name}.json", {**report, "provenance": {**about, **here}})
+    write_record(task.folder / f"{judgement.name}.json", {**report, "provenance": {**about, "contents": contents, **here}})
 
 
 def _summary(task: Task, here: Mapping[str, Any]) -> dict[str, Any]:

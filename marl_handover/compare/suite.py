@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from marl_handover.compare.suite_check import RUN, check
+from marl_handover.compare.suite_check import MAX_SEEDS, RUN, check
 from marl_handover.compose_schema import load_mapping, option_file
-from marl_handover.config import require_at_least, require_choice
+from marl_handover.config import require_between, require_choice
 from marl_handover.errors import CorruptFile, HandoverError, UnknownChoice
 from marl_handover.resources import resource_path
 
@@ -60,7 +60,7 @@ class FigureSpec:
     kind: str = ""  # curves, bars, end_states, profiles, workspace
     title: str = ""
     rows: list[str] = field(default_factory=list)  # empty: all that have such values
-    evaluations: list[str] = field(default_factory=list)  # empty: all; end_states takes one
+    evaluations: list[str] = field(default_factory=list)  # empty: all, unless only some of them are shielded
     measure: str = "success_rate"  # of curves and bars
     x: str = "step"  # of curves: step, or share of the run's training
 
@@ -73,7 +73,7 @@ class TableSpec:
     kind: str = ""  # evaluation, milestones, runs, comparison
     title: str = ""
     rows: list[str] = field(default_factory=list)
-    evaluations: list[str] = field(default_factory=list)
+    evaluations: list[str] = field(default_factory=list)  # as of figures
     pairs: list[list[str]] = field(default_factory=list)  # of comparison: [better?, than]
     paths: bool = False  # of evaluation: also how far the grip travels in a transfer
 
@@ -140,14 +140,14 @@ class Suite:
         return self.with_seeds(self.quick.seeds, at_most=True, size="quick")
 
     def with_seeds(self, count: int, at_most: bool = False, **changes: Any) -> Suite:
-        """This suite with ``count`` seeds for every row and evaluation, or with no more than those."""
-        require_at_least("seeds", count, 1)
+        """This suite with ``count`` seeds for every row, or with no more than those. An evaluation of fewer runs keeps to its number."""
+        require_between("seeds", count, 1, MAX_SEEDS)
 
         def less(own: int) -> int:
             return min(own or self.seeds, count) if at_most else count
 
         rows = [replace(row, seeds=less(row.seeds)) for row in self.rows]
-        evaluations = [replace(spec, seeds=less(spec.seeds) if spec.seeds else 0) for spec in self.evaluations]
+        evaluations = [replace(spec, seeds=min(spec.seeds, count)) for spec in self.evaluations]
         return replace(self, seeds=less(self.seeds), rows=rows, evaluations=evaluations, **changes)
 
     def with_rows(self, names: Sequence[str]) -> Suite:

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING
 
-from marl_handover.config import require_at_least, require_choice
+from marl_handover.config import require_at_least, require_between, require_choice
 from marl_handover.errors import HandoverError
+from marl_handover.policies.shielded import SHIELDED
 
 if TYPE_CHECKING:
     from marl_handover.compare.suite import FigureSpec, RowSpec, Suite, TableSpec
@@ -48,6 +49,11 @@ OWN_TRAIN = ("seed", "out", "resume", "progress")
 OWN_EVALUATE = ("policy", "seed")
 """Arguments that a suite sets itself for every run."""
 
+MAX_SEEDS = 1000
+
+RECORDS = ("task", "trained", "done")
+"""Names of a run's own records, which stand beside one for each evaluation."""
+
 _NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
 
 
@@ -61,8 +67,8 @@ class BadEntry(HandoverError):
 
 def check(suite: Suite) -> None:
     """Raise a :class:`HandoverError` that names the first entry that cannot be meant."""
-    require_at_least("seeds", suite.seeds, 1)
-    require_at_least("quick.seeds", suite.quick.seeds, 1)
+    require_between("seeds", suite.seeds, 1, MAX_SEEDS)
+    require_between("quick.seeds", suite.quick.seeds, 1, MAX_SEEDS)
     require_at_least("number of rows", len(suite.rows), 1)
     for what in ("rows", "evaluations", "figures", "tables"):
         names: list[str] = []
@@ -84,10 +90,11 @@ def check(suite: Suite) -> None:
         _check_shown(suite, f"tables: {table.name}", table, TABLES)
         if table.kind == "comparison":
             _check_pairs(suite, table)
+    _check_shield(suite)
 
 
 def _check_row(row: RowSpec) -> None:
-    require_at_least(f"seeds of {row.name}", row.seeds, 0)
+    require_between(f"seeds of {row.name}", row.seeds, 0, MAX_SEEDS)
     if (row.train is None) == (not row.policy):
         raise BadEntry(f"rows: {row.name}", "give `train`, a list that may be empty, or `policy`, one of the two")
     if RUN in row.policy:
@@ -97,7 +104,9 @@ def _check_row(row: RowSpec) -> None:
 def _check_evaluations(suite: Suite) -> None:
     rows = tuple(row.name for row in suite.rows)
     for spec in suite.evaluations:
-        require_at_least(f"seeds of {spec.name}", spec.seeds, 0)
+        require_between(f"seeds of {spec.name}", spec.seeds, 0, MAX_SEEDS)
+        if spec.name in RECORDS:
+            raise BadEntry(f"evaluations: {spec.name}", f"a run's own records are called so; any name but {', '.join(RECORDS)}")
         for name in spec.rows:
             require_choice(f"evaluations: {spec.name}: rows", name, rows)
             if RUN in spec.policy and suite.row(name).train is None:
@@ -137,6 +146,22 @@ def _check_shown(suite: Suite, where: str, spec: FigureSpec | TableSpec, kinds: 
     for key, known in (("rows", suite.rows), ("evaluations", suite.evaluations)):
         for name in getattr(spec, key):
             require_choice(f"{where}: {key}", name, tuple(entry.name for entry in known))
+
+
+def _check_shield(suite: Suite) -> None:
+    """The shield knows the rule book: what it mended never passes for what was learned.
+
+    Evaluations of both kinds stand beside one another only where the suite names them; in a profile, where scores are pooled, never.
+    """
+    every = [entry.name for entry in suite.evaluations]
+    mended = [entry.name for entry in suite.evaluations if entry.policy.startswith(SHIELDED)]
+    for what, specs, kinds in (("figures", suite.figures, FIGURES), ("tables", suite.tables, TABLES)):
+        for spec in specs:
+            shown = (spec.evaluations or every) if "evaluations" in kinds[spec.kind] else []
+            shielded, others = [name for name in shown if name in mended], [name for name in shown if name not in mended]
+            if shielded and others and (spec.kind == "profiles" or not spec.evaluations):
+                reason = f"shielded ones ({', '.join(shielded)}) would be mixed with {', '.join(others)}; name those that are meant"
+                raise BadEntry(f"{what}: {spec.name}: evaluations", reason)
 
 
 def _check_pairs(suite: Suite, table: TableSpec) -> None:

@@ -61,7 +61,7 @@ def make_tables(results: Tree) -> list[Table]:
 def markdown(table: Table) -> str:
     """The table in Markdown, without its title."""
     lines = [[column.title for column in table.columns], ["---"] * len(table.columns)]
-    lines += [[cell.text for cell in row] for row in table.rows]
+    lines += [[cell.text.replace("|", "\\|") for cell in row] for row in table.rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 

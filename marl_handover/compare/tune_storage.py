@@ -52,9 +52,16 @@ def hidden(text: str) -> str:
 def located(storage: str, folder: Path) -> str:
     """``storage`` as workers need it, who may stand in another folder; a journal file in ``folder`` if it is empty.
 
-    Raises :class:`StorageUnavailable` for a URL without its slashes, which would pass for a path.
+    Raises :class:`StorageUnavailable` for a URL without its slashes, which would pass for a path, and for a database in memory, which
+    every worker would have one of its own of, and which would end with the call.
     """
-    if "://" in storage:
+    scheme, slashes, rest = storage.partition("://")
+    if slashes and scheme.partition("+")[0] == "sqlite" and rest[:1] in ("", "/"):
+        name, mark, options = rest.removeprefix("/").partition("?")
+        if not name or ":memory:" in rest or "mode=memory" in options:
+            raise StorageUnavailable(storage, "is a database in memory, which no other process sees; sqlite:///file keeps the study")
+        return storage if name.startswith("file:") else f"{scheme}:///{Path(name).absolute()}{mark}{options}"
+    if slashes:
         return storage
     if re.match(r"\w+:", storage):
         raise StorageUnavailable(storage, "is neither a URL, such as postgresql://user:password@host/name, nor the path of a journal file")

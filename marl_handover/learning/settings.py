@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +20,7 @@ from marl_handover.config import (
     require_seed,
 )
 from marl_handover.errors import InvalidSetting
-from marl_handover.learning.algorithm_settings import AlgorithmConfig, OffPolicyConfig, SacConfig
+from marl_handover.learning.algorithm_settings import ALGORITHMS, AlgorithmConfig, OffPolicyConfig, SacConfig
 
 
 @dataclass
@@ -56,7 +57,9 @@ class StageConfig:
     until_success: float = 1.0  # a success rate in evaluation that ends it earlier; 1 = never
 
 
-VARIANTS = ("hierarchical", "centralised", "decentralised")
+VARIANTS: dict[str, Collection[str]] = {"hierarchical": ALGORITHMS, "centralised": ("sac", "box_sac"), "decentralised": ("sac",)}
+"""Formulations, and the algorithms that each has learners for."""
+
 SOURCES = ("batched", "aec")
 BACKENDS = ("kinematic", "noisy", "bullet")
 EXECUTORS = ("direct", "optimised")
@@ -104,7 +107,8 @@ class TrainConfig:
             raise InvalidSetting("task.previous_arm", self.task.previous_arm, "left alone in training; use algorithm.previous_arm")
         self.task.previous_arm = self.algorithm.previous_arm
         self.task.validate()
-        require_choice("variant", self.variant, VARIANTS)
+        require_choice("variant", self.variant, tuple(VARIANTS))
+        require_choice(f"algorithm of variant={self.variant}", self.algorithm.name, tuple(VARIANTS[self.variant]))
         require_choice("source", self.source, SOURCES)
         require_choice("backend", self.backend, BACKENDS)
         require_choice("executor", self.executor, EXECUTORS)
@@ -124,6 +128,8 @@ class TrainConfig:
             require_at_least(f"curriculum[{index}].epsilon_high_deg", stage.epsilon_high_deg, stage.epsilon_low_deg)
         require_seed(self.seed)
         self.algorithm.validate()
+        if self.algorithm.name == "sac" and self.algorithm.layout != "relative":
+            raise InvalidSetting("algorithm.layout", self.algorithm.layout, "'relative' for algorithm=sac; box_sac takes any layout")
         self.centralised.validate()
         if self.variant == "centralised":
             self._validate_centralised()

@@ -18,9 +18,9 @@ from marl_handover.config import NoiseConfig, TaskConfig
 from marl_handover.envs.backends import NoisyBackend
 from marl_handover.envs.handover_aec import HandoverEnv
 from marl_handover.envs.supervisor_env import SupervisorEnv
-from marl_handover.errors import InvalidSetting, UnknownChoice
+from marl_handover.errors import UnknownChoice
 from marl_handover.learning.algorithm import Algorithm
-from marl_handover.learning.algorithm_settings import ALGORITHMS, OffPolicyConfig
+from marl_handover.learning.algorithm_settings import OffPolicyConfig
 from marl_handover.learning.box import BoxSac, Td3
 from marl_handover.learning.dqn import Dqn
 from marl_handover.learning.experience import BatchedExperience, Experience
@@ -67,19 +67,10 @@ class Variant:
         return HindsightReplayBuffer(env.rules, config.replay, env, generator)
 
     def algorithm(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> Algorithm:
-        """The learner that ``config`` names.
-
-        Raises:
-            UnknownChoice: no such algorithm, or not in this variant.
-            InvalidSetting: the hybrid one with a layout that has no block an arm.
-        """
+        """The learner that ``config``, which is valid, names. Raises :class:`UnknownChoice` if this variant has none of that name."""
         name = config.algorithm.name
-        if name not in ALGORITHMS:
-            raise UnknownChoice("algorithm", name, ALGORITHMS)
         if name not in self.algorithms:
-            raise UnknownChoice(f"algorithm of variant={config.variant}", name, self.algorithms)
-        if name == "sac" and config.algorithm.layout != "relative":
-            raise InvalidSetting("algorithm.layout", config.algorithm.layout, "'relative' for algorithm=sac; box_sac takes any layout")
+            raise UnknownChoice(f"algorithm of variant={config.variant}", name, tuple(self.algorithms))
         return self.algorithms[name](rules, config, generator)
 
     def play(self, algorithm: Algorithm, start: Tensor, goal: Tensor) -> Episodes:
@@ -120,7 +111,7 @@ def make_variant(name: str) -> Variant:
         UnknownChoice: no such variant.
     """
     if name not in VARIANTS:
-        raise UnknownChoice("variant", name, VARIANTS)
+        raise UnknownChoice("variant", name, tuple(VARIANTS))
     if name == "hierarchical":
         return Variant()
     module = importlib.import_module(f"marl_handover.learning.{name}")

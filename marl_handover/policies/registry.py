@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import json
 from collections.abc import Mapping
@@ -9,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.cell import Cell, load_cell
@@ -22,7 +24,8 @@ from marl_handover.policies.shielded import SHIELDED, ShieldedPolicy
 from marl_handover.resources import package_path
 from marl_handover.task.rules import Rules
 
-NAMES = ("exact", "random", "greedy", "pretrained_a", "pretrained_b", "pretrained_twin")
+BASELINES = ("exact", "random", "greedy")
+NAMES = (*BASELINES, "pretrained_a", "pretrained_b", "pretrained_twin")
 
 
 def load(
@@ -43,7 +46,7 @@ def load(
     """
     if name.startswith(SHIELDED):
         return ShieldedPolicy(load(name.removeprefix(SHIELDED), cell, task, seed, motion=motion))
-    if name in ("exact", "random", "greedy"):
+    if name in BASELINES:
         rules = _rules(cell or load_cell(), task or TaskConfig(), motion)
         made = {"exact": ExactPolicy, "greedy": GreedyPolicy}
         return RandomPolicy(rules, seed) if name == "random" else made[name](rules)
@@ -78,6 +81,25 @@ def adapted(
     if own.about and settings.architecture != trained:
         raise CheckpointMismatch(name, "architecture", trained, settings.architecture)
     return own.under(_rules(own.rules.cell if cell is None else load_cell(cell), settings, motion, own.about))
+
+
+def content_hash(name: str) -> str:
+    """Short hash of what a trained policy is, wherever its file is, which tells it from another of the same name; empty for a baseline.
+
+    Raises:
+        UnknownChoice, MissingFile, CorruptFile, CheckpointMismatch: as :func:`load`.
+    """
+    name = name.removeprefix(SHIELDED)
+    if name in BASELINES:
+        return ""
+    digest = hashlib.sha256()
+    arrays = dict(_arrays(name))
+    about = json.loads(str(arrays.pop("about")))
+    digest.update(json.dumps({**about, "origin": ""}, sort_keys=True).encode())
+    for key, array in sorted(arrays.items()):
+        digest.update(f"{key} {array.dtype} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:12]
 
 
 def _rules(cell: Cell, task: TaskConfig, motion: MotionConfig | None, about: Mapping[str, Any] | None = None) -> Rules:

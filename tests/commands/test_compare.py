@@ -203,6 +203,26 @@ def test_fresh_knows_which_evaluations_a_row_has(tmp_path, capsys):
     assert "makes nothing anew" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("wrong", ["launcher=rya", "jobs=-1", "launcher=ray address=127.0.0.1:1"])
+def test_nothing_is_thrown_away_before_there_is_somebody_to_make_it_anew(tmp_path, capsys, wrong):
+    if "address" in wrong:
+        pytest.importorskip("ray", reason="the ray extra is not installed")
+    (tmp_path / "small.yaml").write_text(SUITE)
+    assert compared(tmp_path, "rows=[exact]", "seeds=1") == 0
+    before = (tmp_path / "out/exact/seed0/kinematic.json").read_bytes()
+    assert compared(tmp_path, "rows=[exact]", "seeds=1", "fresh=[exact]", *wrong.split()) != 0
+    assert (tmp_path / "out/exact/seed0/kinematic.json").read_bytes() == before
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_all_rows_get_their_first_seed_before_any_gets_its_second(tmp_path, monkeypatch):
+    (tmp_path / "small.yaml").write_text(SUITE)
+    done = []
+    monkeypatch.setattr(runs, "_do", lambda task, do=runs._do: (done.append(task.name), do(task)))
+    assert compared(tmp_path, "rows=[exact,random]") == 0
+    assert done == ["exact/seed0", "random/seed0", "exact/seed1", "random/seed1"]
+
+
 def test_a_part_of_a_suite_says_so_and_leaves_no_pictures_of_another_time(tmp_path, capsys):
     (tmp_path / "small.yaml").write_text(SUITE)
     for folder in ("tables", "figures"):

@@ -134,11 +134,19 @@ def test_a_killed_search_continues(tmp_path):
 
 def test_a_search_without_a_result_says_why(tmp_path, capsys):
     arguments(tmp_path / "study")
-    (tmp_path / "study.yaml").write_text("algorithm.layout: {type: categorical, choices: [raw]}")
+    (tmp_path / "study.yaml").write_text("cell.base_distance_mm: {type: categorical, choices: [4000]}")
     assert main(["tune", *TINY, f"search={tmp_path / 'study.yaml'}", f"out={tmp_path / 'study'}", "trials=1"]) == 1
     err = capsys.readouterr().err
-    assert "no trial of study sac was completed: InvalidSetting" in err
-    assert "algorithm.layout" in rows(tmp_path / "study")[0]["error"]
+    assert "no trial of study sac was completed: NoSharedSpace" in err
+    assert "4000" in rows(tmp_path / "study")[0]["error"]
+
+
+def test_a_folder_holds_one_study(tmp_path, capsys):
+    assert main(["tune", *arguments(tmp_path / "study", "trials=1")]) == 0
+    kept = (tmp_path / "study" / "trials.csv").read_bytes()
+    assert main(["tune", *arguments(tmp_path / "study", "trials=1", "study=another")]) == 2
+    assert "has the trials of study sac" in capsys.readouterr().err
+    assert (tmp_path / "study" / "trials.csv").read_bytes() == kept
 
 
 @pytest.mark.parametrize(
@@ -159,6 +167,8 @@ def test_a_search_without_a_result_says_why(tmp_path, capsys):
         ("storage=postgresql://me:secret@127.0.0.1:1/x", ("storage=postgresql://me:***@127.0.0.1:1/x",)),
         ("storage=postgresql:me:secret@here", ("URL",)),
         ("storage=martian://me:secret@here", ("martian",)),
+        ("storage=sqlite://", ("in memory", "sqlite:///file")),
+        ("storage=sqlite:///:memory:", ("in memory",)),
         ("storage=sqlite:////nowhere/at/all.db", ("sqlite:////nowhere/at/all.db", "cannot be opened")),
         ("storage=/proc/nowhere/study.journal", ("/proc/nowhere",)),
     ],

@@ -43,11 +43,13 @@ def test_how_many_runs_have_solved_anything_is_told():
     results = {
         "tables": [spec],
         "evaluations": [{"name": "k", "label": ""}],
-        "rows": [{"name": "a", "label": "a", "evaluations": {"k": found}}],
+        "rows": [{"name": "a", "label": "a|b", "evaluations": {"k": found}}],
     }
     (table,) = make_tables(results)
     text = markdown(table)
+    assert "a\\|b" in text
     assert "| steps (solved) | steps ÷ optimum (solved) | path, mm |" in text
     assert "| 0.50 [0.40, 0.60] | 0.500 [0.400, 0.600] (2 of 5 runs) | 0 [0, 1] | – |" in text
     assert "| 5 (≈ 90 %) |" in text
+    assert "\na|b," in csv_text(table)
     assert "steps_ratio_runs,path_mm,path_mm_low,path_mm_high" in csv_text(table)

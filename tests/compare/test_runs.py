@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -12,15 +13,20 @@ from pathlib import Path
 
 import pytest
 
+from marl_handover.cell import load_cell
 from marl_handover.commands import evaluate, train
 from marl_handover.compare import runs
 from marl_handover.compare.plan import Grammar, plan_tasks
 from marl_handover.compare.records import commits_of, fingerprint, read_record, settings_of, usual_settings
 from marl_handover.compare.runs import Busy, ChangedRow, IncompleteTask, Task, check_unchanged, clear, clear_all, execute, finished
 from marl_handover.compare.suite import load_suite
+from marl_handover.config import TaskConfig
 from marl_handover.learning import trainer
+from marl_handover.learning.evaluation import random_problems
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.trainer import Trainer
+from marl_handover.resources import package_path
+from marl_handover.task.rules import Rules
 
 TRAIN, EVALUATE = Grammar(train.ALIASES, train.GROUPS), Grammar(evaluate.ALIASES, evaluate.GROUPS)
 TINY = (
@@ -219,6 +225,45 @@ def test_a_changed_row_is_refused_by_name_and_key(home, old, new, what, key):
     name = what.split()[1]
     assert f"fresh=[{name}]" in str(caught.value)
     check_unchanged(task, [name])
+
+
+def test_a_setting_that_is_taken_back_is_a_change(tmp_path):
+    """The whole section is left out then, and its settings are no longer asked about."""
+    quiet = SUITE.replace("  - {name: b, train: []}\n", "")
+    noisy = quiet.replace("{name: kinematic, arguments: [episodes=20]}", "{name: kinematic, arguments: [episodes=20, NOISE]}")
+    noisy = noisy.replace("NOISE", '"task.noise={position_mm:2,yaw_deg:2}"')
+    execute(planned(tmp_path, noisy)["exact"])
+    for text, key in ((quiet, r"task\.noise\.position_mm = 2"), (noisy.replace("position_mm:2", "position_mm:0"), "and now it is 0")):
+        with pytest.raises(ChangedRow, match=key):
+            check_unchanged(planned(tmp_path, text)["exact"])
+    check_unchanged(planned(tmp_path, noisy)["exact"])
+
+
+def test_another_file_of_the_same_name_is_a_change(tmp_path, monkeypatch):
+    """A worker may stand in another folder, and who reads the report may have none of the files."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(package_path("pretrained/b.npz"), "mine.npz")
+    rules = Rules(load_cell(), TaskConfig())
+    problems = [
+        json.dumps({"state": start.tolist(), "goal": goal.tolist()}) for start, goal in zip(*random_problems(rules, 3, 0), strict=True)
+    ]
+    Path("mine.jsonl").write_text("\n".join(problems[:2]))
+    text = "rows: [{name: mine, policy: ./mine.npz}]\nevaluations: [{name: chosen, arguments: [problems=mine.jsonl]}]"
+    task = planned(tmp_path, text)["mine"]
+    monkeypatch.chdir("/")
+    execute(task)
+    assert read_record(task.folder / "chosen.json")["episodes"] == 2
+    monkeypatch.chdir(tmp_path)
+    check_unchanged(planned(tmp_path, text)["mine"])
+    Path("mine.jsonl").write_text("\n".join(problems))
+    with pytest.raises(ChangedRow, match="content of problems"):
+        check_unchanged(planned(tmp_path, text)["mine"])
+    Path("mine.jsonl").unlink()
+    shutil.copy(package_path("pretrained/twin.npz"), "mine.npz")
+    with pytest.raises(ChangedRow, match=r"content of policy.*fresh=\[mine/chosen\]"):
+        check_unchanged(planned(tmp_path, text)["mine"])
+    Path("mine.npz").unlink()
+    check_unchanged(planned(tmp_path, text)["mine"])
 
 
 def test_an_unchanged_row_passes_and_so_does_one_older_than_a_setting(home):

@@ -109,6 +109,7 @@ def test_the_smoke_size_has_the_last_word(suite):
 def test_seeds_and_rows_from_the_command_line(suite):
     more = suite.with_seeds(7)
     assert [len(more.seeds_of(row)) for row in more.rows] == [7, 7, 7]
+    assert [len([seed for seed in range(7) if spec in more.evaluations_of(more.row("a"), seed)]) for spec in more.evaluations] == [7, 1, 7]
     assert [row.name for row in suite.with_rows(["exact", "a"]).rows] == ["a", "exact"]
     with pytest.raises(UnknownChoice, match="a, b, exact"):
         suite.with_rows(["c"])
@@ -152,6 +153,12 @@ def test_seeds_and_rows_from_the_command_line(suite):
         ("quick:", "tables: [{name: t, kind: comparison}]\nquick:", "a comparison needs some"),
         ("quick:", "tables: [{name: t, kind: comparison, pairs: [[a]]}]\nquick:", "a pair has two rows"),
         ("quick:", "tables: [{name: t, kind: comparison, pairs: [[a, z]]}]\nquick:", "tables: t: pairs"),
+        ("seeds: 3", "seeds: 99999999999", "seeds = 99999999999: must be between 1 and 1000"),
+        ("{name: b, train: []}", "{name: b, train: [], seeds: 1001}", "seeds of b = 1001"),
+        ("{name: chosen", "{name: done", "evaluations: done: a run's own records are called so"),
+        ("quick:", "figures: [{name: f, kind: bars}]\nquick:", r"figures: f: evaluations: shielded ones \(shielded\) would be mixed"),
+        ("quick:", "tables: [{name: t, kind: evaluation}]\nquick:", "tables: t: evaluations: .* with kinematic, chosen"),
+        ("quick:", "figures: [{name: f, kind: profiles, evaluations: [kinematic, shielded]}]\nquick:", "mixed with kinematic; name"),
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path, old, new, words):
@@ -167,6 +174,31 @@ def test_a_suite_needs_rows_and_a_file(tmp_path):
         load_suite("papper")
     with pytest.raises(MissingFile):
         load_suite(str(tmp_path / "none.yaml"))
+
+
+def test_both_kinds_of_evaluation_stand_side_by_side_where_the_suite_names_them(tmp_path):
+    text = MINIMAL.replace("quick:", "figures: [{name: f, kind: bars, evaluations: [kinematic, shielded]}]\nquick:")
+    assert load_suite(written(tmp_path, text)).figures[0].evaluations == ["kinematic", "shielded"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("{name: b, train: []}", "{name: b, policy: rndom}", "row b: policy = 'rndom' is not known; choose one of: exact, random"),
+        ("{name: b, train: []}", "{name: b, train: [], evaluate: [architecture=A]}", "kinematic: task.architecture = 'A': must be B"),
+        (
+            "{name: b, train: []}",
+            "{name: b, train: [variant=centralised], evaluate: [backend=bullet]}",
+            "kinematic for variant=centralised",
+        ),
+        ("{name: b, train: []}", "{name: b, train: [variant=decentralised, algorithm=td3]}", "'td3' is not known; choose one of: sac"),
+        ("{name: b, train: []}", "{name: b, train: [algorithm.layout=raw]}", "algorithm.layout = 'raw'"),
+    ],
+)
+def test_what_could_never_be_done_is_told_before_anything_is(tmp_path, old, new, words):
+    suite = load_suite(written(tmp_path, MINIMAL.replace(old, new, 1)))
+    with pytest.raises(BadRow, match=words):
+        plan_tasks(suite, Path("out"), TRAIN, EVALUATE)
 
 
 @pytest.mark.parametrize("argument", ["steps=0", "stepz=3", "architecture=C"])

@@ -142,7 +142,8 @@ def test_a_relative_journal_is_the_same_file_in_every_folder(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     assert located("a.journal", tmp_path / "out") == str(tmp_path / "a.journal")
     assert located("", tmp_path / "out") == str(tmp_path / "out" / "study.journal")
-    assert located("sqlite:///a.db", tmp_path) == "sqlite:///a.db"
+    assert located("sqlite:///a.db", tmp_path) == f"sqlite:///{tmp_path / 'a.db'}"
+    assert located("sqlite+pysqlite:////data/a.db?timeout=5", tmp_path) == "sqlite+pysqlite:////data/a.db?timeout=5"
 
 
 def test_a_study_is_the_same_every_time_and_starts_with_the_settings_as_they_are(search, tmp_path):
@@ -212,13 +213,13 @@ def test_a_hopeless_trial_is_ended_and_its_run_stays_whole(search):
 
 
 def test_settings_that_cannot_be_trained_with_fail_their_trial_only(search):
-    search.origin.write_text("algorithm.layout: {type: categorical, choices: [relative, raw]}")
+    search.origin.write_text("cell.base_distance_mm: {type: categorical, choices: [360.0, 4000.0]}")
     search = replace(search, space=load_space(search.origin, search.train), trials=2)
-    prepare(search)[0].enqueue_trial({"algorithm.layout": "raw"})
+    prepare(search)[0].enqueue_trial({"cell.base_distance_mm": "4000.0"})
     study, notes = carried_out(search)
-    by_layout = {trial.params["algorithm.layout"]: trial.state for trial in study.trials}
-    assert by_layout == {"relative": TrialState.COMPLETE, "raw": TrialState.FAIL}
-    assert all(("algorithm.layout" in note.error) == (note.state == "FAIL") for note in notes)
+    by_distance = {trial.params["cell.base_distance_mm"]: trial.state for trial in study.trials}
+    assert by_distance == {"360.0": TrialState.COMPLETE, "4000.0": TrialState.FAIL}
+    assert all(("4000" in note.error) == (note.state == "FAIL") for note in notes)
     assert counted(study) == 2
 
 
