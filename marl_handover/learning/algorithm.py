@@ -97,6 +97,9 @@ class Algorithm(ABC):
 def compiled(function: Callable[..., Any], mode: str) -> Callable[..., Any]:
     """``function`` compiled, or itself.
 
+    What was compiled in this process before is forgotten, and compiled again if it is still used. Torch keeps eight versions of a function
+    and runs the ninth uncompiled, so that a run would be slower, and round otherwise, for coming after others in the same process.
+
     Args:
         function: takes and returns tensors.
         mode: ``off``; ``auto``: compile where that is possible, else say so in one line and run it as it is; ``on``: or raise.
@@ -108,6 +111,7 @@ def compiled(function: Callable[..., Any], mode: str) -> Callable[..., Any]:
         raise InvalidSetting("compile", mode, "auto or off on a machine without a C++ compiler and Python's headers (see doctor)")
     if mode == "off" or not can_compile():
         return function
+    torch.compiler.reset()
     fast = torch.compile(function, dynamic=False)
     return fast if mode == "on" else _Fallback(function, fast)
 

@@ -69,3 +69,13 @@ def test_compiled_and_eager_losses_agree(small, tmp_path):
     noise = torch.randn(len(batch), 2, 1, 2)
     inputs = (*unpacked(batch), noise)
     torch.testing.assert_close(algorithm.compiled(loss.critic_loss, "on")(*inputs), loss.critic_loss(*inputs), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not algorithm.can_compile(), reason="no C++ compiler")
+def test_a_training_is_compiled_however_many_came_before_it_in_the_process(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch._dynamo.config, "recompile_limit", 2)
+    monkeypatch.setattr(torch._dynamo.config, "fail_on_recompile_limit_hit", True)
+    for gamma in (0.9, 0.91, 0.92, 0.93):  # a constant in what is compiled
+        settings = small("sac", "compile=on", "steps=512", f"algorithm.gamma={gamma}")
+        assert Trainer(settings, tmp_path / str(gamma)).run()["gradient_step"] > 0
