@@ -96,6 +96,28 @@ def test_evidence_names_settings_seeds_and_commits(suite):
         assert (row["config_hash"] is None) == (row["settings"] is None)
 
 
+def test_what_the_page_says_of_failures_costs_and_places_is_what_the_runs_say():
+    said = " ".join(PAGE.split())
+    rows = {(suite, row["name"]): row for suite in EVIDENCE for row in EVIDENCE[suite]["rows"]}
+    ours = rows["paper", "ours_b"]["evaluations"]["kinematic"]
+    fails = ours["outcomes"]
+    lost = ours["episodes"] - fails["success"]
+    assert f"{100 * ours['success_rate']['value']:.2f} % over five runs after 48,000 transfers" in said
+    assert f"50,000 episodes {lost} fail: {fails['timeout']} run out of transfers, {fails['wrong_position']} ends off the goal" in said
+    assert (ours["episodes"], fails["wrong_orientation"]) == (50_000, 0)
+    settings = {name: rows["paper", name]["settings"] for name in ("paper_a", "dqn_a", "dqn_b")}
+    assert [kind["replay.hindsight.strategy"] for kind in settings.values()] == ["none", "none", "future"]
+    assert [kind["algorithm.layout"] for kind in settings.values()] == ["raw", "relative", "relative"]
+    cost = {name: rows["variants", name]["milestones"]["90"]["median"] for name in ("hierarchical", "decentralised_independent")}
+    assert int(cost["decentralised_independent"] / cost["hierarchical"]) == 5
+    near = {name: round(100 * row["share_near"]) for name, row in json.loads((SINGLE / "places.json").read_text())["rows"].items()}
+    assert f"{near.pop('decentralised_shared')} % of their hand-overs lie within 4 mm of the edge" in said
+    assert (
+        f"Of independent arms' {near.pop('decentralised_independent')} % do, of all others' {min(near.values())} to {max(near.values())} %"
+        in said
+    )
+
+
 def test_what_the_page_says_of_single_runs_is_what_they_say():
     said = " ".join(PAGE.split())
     random = json.loads((SINGLE / "random_a_30deg.json").read_text())
@@ -103,7 +125,7 @@ def test_what_the_page_says_of_single_runs_is_what_they_say():
     assert f"even with 30° it takes {random['mean_steps']:.1f} " in said
     raw = json.loads((SINGLE / "dqn_raw" / "evaluation.json").read_text())
     steps = json.loads((SINGLE / "dqn_raw" / "summary.json").read_text())["step"]
-    assert f"Without both it solves {100 * raw['success_rate']:.2f} % after {steps:,} transfers (one seed)" in said
+    assert f"Without both B's solves {100 * raw['success_rate']:.2f} % after {steps:,} transfers (one seed)" in said
     solved = []
     for seed in range(3):
         with open(SINGLE / "paper_b_training" / f"seed{seed}.csv", newline="", encoding="utf-8") as lines:
