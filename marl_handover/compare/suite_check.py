@@ -91,6 +91,7 @@ def check(suite: Suite) -> None:
         if table.kind == "comparison":
             _check_pairs(suite, table)
     _check_shield(suite)
+    _check_profiles(suite)
 
 
 def _check_row(row: RowSpec) -> None:
@@ -162,6 +163,16 @@ def _check_shield(suite: Suite) -> None:
             if shielded and others and (spec.kind == "profiles" or not spec.evaluations):
                 reason = f"shielded ones ({', '.join(shielded)}) would be mixed with {', '.join(others)}; name those that are meant"
                 raise BadEntry(f"{what}: {spec.name}: evaluations", reason)
+
+
+def _check_profiles(suite: Suite) -> None:
+    """A profile pools the evaluations it shows, so that a row that lacks one has none."""
+    for spec in suite.figures:
+        shown = spec.evaluations or [entry.name for entry in suite.evaluations]
+        for name in spec.rows if spec.kind == "profiles" else ():
+            judged = [entry.name for entry in suite.evaluations_of(suite.row(name), 0)]
+            if lacking := [entry for entry in shown if entry not in judged]:
+                raise BadEntry(f"figures: {spec.name}: rows", f"{name} would be left out: it is not judged by {', '.join(lacking)}")
 
 
 def _check_pairs(suite: Suite, table: TableSpec) -> None:

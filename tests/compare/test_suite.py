@@ -158,6 +158,7 @@ def test_seeds_and_rows_from_the_command_line(suite):
         ("{name: chosen", "{name: done", "evaluations: done: a run's own records are called so"),
         ("quick:", "figures: [{name: f, kind: bars}]\nquick:", r"figures: f: evaluations: shielded ones \(shielded\) would be mixed"),
         ("quick:", "tables: [{name: t, kind: evaluation}]\nquick:", "tables: t: evaluations: .* with kinematic, chosen"),
+        ("quick:", "figures: [{name: f, kind: profiles, rows: [b], evaluations: [chosen]}]\nquick:", "f: rows: b would be left out"),
         ("quick:", "figures: [{name: f, kind: profiles, evaluations: [kinematic, shielded]}]\nquick:", "mixed with kinematic; name"),
     ],
 )
