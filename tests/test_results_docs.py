@@ -118,6 +118,43 @@ def test_what_the_page_says_of_failures_costs_and_places_is_what_the_runs_say():
     )
 
 
+def test_what_the_page_says_of_ablations_is_what_the_runs_say():
+    said = " ".join(PAGE.split())
+    rows = {row["name"]: row for row in EVIDENCE["ablations"]["rows"]}
+    planner = next(row for row in EVIDENCE["paper"]["rows"] if row["name"] == "exact_b")
+    rate = {name: 100 * row["evaluations"]["kinematic"]["success_rate"]["value"] for name, row in rows.items()}
+    more = {name: 100 * (row["evaluations"]["kinematic"]["steps_ratio"]["value"] - 1) for name, row in rows.items()}
+    judged = {name: row["evaluations"] for name, row in rows.items() if "execution" in row["evaluations"]}
+    noisy = {name: 100 * found["execution"]["success_rate"]["value"] for name, found in judged.items()}
+    seen = [100 * found["observation"]["success_rate"]["value"] for found in judged.values()]
+    steps = {name: found["execution"]["mean_steps"]["value"] for name, found in judged.items()}
+    cost = {(name, level): row["milestones"][level]["median"] for name, row in rows.items() for level in ("95", "99")}
+    for words in (
+        f"with our features, solves {rate['box_sac']:.0f} %, TD3 {rate['td3']:.0f} %; "
+        f"with the paper's raw features it is {rate['box_raw']:.0f} %",
+        f"makes {rows['ppo']['runs'][0]['trained']['gradient_step']} gradient steps of them, solves {rate['ppo']:.0f} %",
+        f"without it {cost['her_none', '95']:,.0f} instead of {cost['base', '95']:,.0f} to 95 %, "
+        f"and {more['her_none']:.0f} % more transfers than are needed instead of {more['base']:.0f} %",
+        f"solves {rate['base']:.1f} %, mirrored samples {rate['symmetry_data']:.1f} %, none {rate['symmetry_none']:.1f} %",
+        f"{cost['base', '95']:,.0f}, {cost['symmetry_data', '95']:,.0f} and {cost['symmetry_none', '95']:,.0f} transfers",
+        f"5° throughout is at 99 % after {cost['curriculum_none', '99']:,.0f} transfers; the default",
+        f"serves 0.7° to 12°, after {cost['base', '99']:,.0f}.",
+        f"solves {rate['epsilon_1']:.1f} %, at 10° {rate['epsilon_10']:.2f} %",
+        f"At d = 330 mm {rate['distance_330']:.1f} % with {more['distance_330']:.0f} % more transfers",
+        f"at 420 mm {rate['distance_420']:.2f} % and half a per cent more",
+        f"solves {noisy['noise_execution']:.1f} % under it, more than the exact planner, which knows of none "
+        f"({100 * planner['evaluations']['noise']['success_rate']['value']:.1f} %)",
+        f"(inset 0.9) is worth {noisy['inset_90']:.1f} %",
+        f"all solve {min(seen):.0f} to {max(seen):.0f} %",
+    ):
+        assert words in said
+    assert round(more["distance_420"], 1) == 0.5
+    assert f"it takes {100 * (steps['noise_execution'] / steps['base'] - 1):.0f} % more transfers for that" in said
+    assert round(rate["base"] - rate["noise_execution"]) == 1
+    assert min(rate[name] for name in ("her_final", "her_episode", "her_2", "her_4", "her_5")) > 99.8
+    assert min(rate["no_previous"], rate["explore_area"]) > 99.9
+
+
 def test_what_the_page_says_of_single_runs_is_what_they_say():
     said = " ".join(PAGE.split())
     random = json.loads((SINGLE / "random_a_30deg.json").read_text())

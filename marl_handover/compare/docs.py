@@ -86,6 +86,8 @@ def partial_line(results: Mapping[str, Any]) -> str:
     groups: dict[str, list[str]] = {}
     for part in results["progress"]:
         groups.setdefault(f"{part['done']} of {part['of']} seeds so far", []).append(f"*{part['label']}*")
+    if len(groups) == 1:
+        return f"Partial: {next(iter(groups))}, of all rows."
     return "Partial: " + "; ".join(f"{count}: {', '.join(labels)}" for count, labels in groups.items()) + "."
 
 

@@ -70,3 +70,4 @@ def test_rows_that_are_equally_far_are_told_together():
     rows = [("a", 2, 5), ("b", 2, 5), ("c", 3, 3)]
     progress = [{"label": label, "done": done, "of": of} for label, done, of in rows]
     assert partial_line({"progress": progress}) == "Partial: 2 of 5 seeds so far: *a*, *b*; 3 of 3 seeds so far: *c*."
+    assert partial_line({"progress": progress[:2]}) == "Partial: 2 of 5 seeds so far, of all rows."
