@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.interpolate import BSpline
 
-from marl_handover.cell.urdf import ARM_JOINTS
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.paper_method import plan_paper
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.segment import FoundPath, NoPath, Segment

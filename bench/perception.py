@@ -29,8 +29,9 @@ from tqdm import tqdm
 from marl_handover.arrays import wrap
 from marl_handover.cell.build import CellModel, build_cell, cell_config
 from marl_handover.config import MotionConfig
+from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.boards import charuco_sheet
-from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels, flat_pose, hung_camera
+from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels, hung_camera
 from marl_handover.perception.detector import Detector
 from marl_handover.perception.intrinsics import calibrate_lens
 from marl_handover.perception.plane import BoardOnTable, locate_by_board

@@ -96,8 +96,7 @@ def _place(planner: MotionPlanner, generator: np.random.Generator, arm: int) -> 
     """A point of the arm's manipulation space, in the world, uniform over its area."""
     cell, base = planner.model.cell, planner.model.cell.bases[arm]
     r = np.sqrt(generator.uniform(cell.r_min_mm**2, cell.r_max_mm**2))
-    angle = base.facing_rad + generator.uniform(*cell.yaw_rad)
-    return np.array([base.x_mm + r * np.cos(angle), base.y_mm + r * np.sin(angle)])
+    return base.around(r, generator.uniform(*cell.yaw_rad))
 
 
 def _posture(planner: MotionPlanner, generator: np.random.Generator, arm: int) -> Any:

@@ -14,8 +14,9 @@ from PIL import Image
 from marl_handover import cli
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import MotionConfig
+from marl_handover.geometry.se3 import flat_pose
 from marl_handover.palette import YELLOW
-from marl_handover.perception.calibration import flat_pose, hung_camera
+from marl_handover.perception.calibration import hung_camera
 from marl_handover.perception.detector import Detector
 from marl_handover.perception.overlay import Mark, annotated
 from marl_handover.perception.scene import CellPainter

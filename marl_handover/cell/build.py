@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 from marl_handover.cell.cell import Cell, mirrored_pair
 from marl_handover.cell.chart import Chart
-from marl_handover.cell.kinematics import ArmModel
 from marl_handover.cell.spaces import AnnulusFit, ManipulationGrid, fit_annulus, manipulation_grid
-from marl_handover.cell.urdf import read_urdf
 from marl_handover.compose import from_yaml, to_yaml
 from marl_handover.config import CellConfig, require_at_least, require_between, require_choice, require_positive
 from marl_handover.errors import MissingFile
+from marl_handover.geometry.closed_form import ClosedFormArm
+from marl_handover.geometry.urdf import read_urdf
 from marl_handover.resources import resource_path
 
 
@@ -20,7 +20,7 @@ class CellModel(NamedTuple):
     """A cell with everything it was computed from."""
 
     cell: Cell
-    arm: ArmModel
+    arm: ClosedFormArm
     grid: ManipulationGrid
     fit: AnnulusFit
 
@@ -46,9 +46,9 @@ def build_cell(config: CellConfig) -> CellModel:
         require_positive(f"cell.{name}", getattr(config, name))
     require_at_least("cell.fit_rounding_mm", config.fit_rounding_mm, 0)
     require_between("cell.chart_inset", config.chart_inset, 0.1, 1)
-    arm = ArmModel(read_urdf(urdf_path(config.urdf), config.grasp_link), config.joint_limits_deg)
+    arm = ClosedFormArm(read_urdf(urdf_path(config.urdf), config.grasp_link), config.joint_limits_deg)
     bases = mirrored_pair(config.base_distance_mm)
-    grid = manipulation_grid(arm, config, [(base.x_mm, base.y_mm, base.facing_rad) for base in bases])
+    grid = manipulation_grid(arm, config, bases)
     fit = fit_annulus(grid, config.fit_rounding_mm)
     Chart(fit.r_min_mm, fit.r_max_mm, config.base_distance_mm, config.chart_inset)
     cell = Cell(bases, fit.r_min_mm, fit.r_max_mm, (fit.yaw_lower_rad, fit.yaw_upper_rad), config)

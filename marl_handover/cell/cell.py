@@ -16,24 +16,17 @@ from marl_handover.arrays import Array, namespace
 from marl_handover.cell.chart import Chart
 from marl_handover.config import CellConfig
 from marl_handover.errors import NoSharedSpace
+from marl_handover.geometry.se2 import SE2
 
 REACH_TOLERANCE_MM = 1e-3
 """Membership has this tolerance everywhere: at beta = +-1 float32 rounding would put one chart point in ten outside."""
 
 
 @dataclass(frozen=True)
-class Base:
-    """Where an arm stands: position, and the unit vector along its zero yaw. ``mirror`` is -1 for the arm that is the mirror image."""
+class Base(SE2):
+    """Where an arm stands; its frame's +x axis is the direction of zero yaw. ``mirror`` is -1 for the arm that is the mirror image."""
 
-    x_mm: float
-    y_mm: float
-    facing: tuple[float, float]
     mirror: int
-
-    @property
-    def facing_rad(self) -> float:
-        """World direction of zero yaw."""
-        return math.atan2(self.facing[1], self.facing[0])
 
 
 def mirrored_pair(base_distance_mm: float) -> tuple[Base, Base]:

@@ -9,16 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from marl_handover.cell.collision import ground_clearance_mm, self_clearance_mm
-from marl_handover.cell.kinematics import ArmModel, Bools, Floats
 from marl_handover.config import CellConfig, require_at_least, require_positive
 from marl_handover.errors import InvalidSetting
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
+from marl_handover.geometry.closed_form import Bools, Floats
+from marl_handover.geometry.se2 import SE2
 
 LENGTH_TOLERANCE_MM = 1e-6
 ANGLE_TOLERANCE_RAD = 1e-9
-
-BasePose = tuple[float, float, float]
-"""A base in the world: x [mm], y [mm], facing [rad], the direction of its frame's +x."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +31,12 @@ class ManipulationGrid:
     x_mm: Floats
     y_mm: Floats
     masks: Bools
-    bases: tuple[BasePose, ...]
+    bases: tuple[SE2, ...]
     pick_height_mm: float
 
     def points_base_mm(self, arm_index: int) -> Floats:
         """The grid points (nx, ny, 2) in the base frame of one arm."""
-        return points_in_base(np.stack(np.meshgrid(self.x_mm, self.y_mm, indexing="ij"), axis=-1), self.bases[arm_index])
+        return self.bases[arm_index].to_local(np.stack(np.meshgrid(self.x_mm, self.y_mm, indexing="ij"), axis=-1))
 
 
 @dataclass(frozen=True)
@@ -54,14 +53,6 @@ class AnnulusFit:
     yaw_upper_rad: float
     false_inside_rate: float
     missed_rate: float
-
-
-def points_in_base(points_mm: ArrayLike, base: BasePose) -> Floats:
-    """World points (..., 2) in the frame of a base, whose +x is its facing."""
-    x_mm, y_mm, facing_rad = base
-    dx, dy = (np.asarray(points_mm, dtype=float)[..., axis] - origin for axis, origin in ((0, x_mm), (1, y_mm)))
-    cos, sin = math.cos(facing_rad), math.sin(facing_rad)
-    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)
 
 
 def feasible(arm: ArmModel, points_base_mm: ArrayLike, pick_height_mm: float) -> Bools:
@@ -81,7 +72,7 @@ def feasible(arm: ArmModel, points_base_mm: ArrayLike, pick_height_mm: float) ->
     return np.asarray(good.any(axis=-1))
 
 
-def manipulation_grid(arm: ArmModel, cell: CellConfig, bases: Sequence[BasePose]) -> ManipulationGrid:
+def manipulation_grid(arm: ArmModel, cell: CellConfig, bases: Sequence[SE2]) -> ManipulationGrid:
     """The grid of world points that covers the reach of one ``arm`` standing on each of ``bases``.
 
     Raises :class:`InvalidSetting` if ``grid_mm`` is not above 0 or ``pick_height_mm`` is not a finite number of at least 0.
@@ -90,11 +81,11 @@ def manipulation_grid(arm: ArmModel, cell: CellConfig, bases: Sequence[BasePose]
     require_at_least("pick_height_mm", cell.pick_height_mm, 0)
     axes: list[Floats] = []
     for axis in range(2):
-        low = math.floor((min(base[axis] for base in bases) - arm.reach_mm) / cell.grid_mm)
-        high = math.ceil((max(base[axis] for base in bases) + arm.reach_mm) / cell.grid_mm)
+        low = math.floor((min(base.position_mm[axis] for base in bases) - arm.reach_mm) / cell.grid_mm)
+        high = math.ceil((max(base.position_mm[axis] for base in bases) + arm.reach_mm) / cell.grid_mm)
         axes.append(cell.grid_mm * np.arange(low, high + 1, dtype=np.float64))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    masks = np.stack([feasible(arm, points_in_base(points, base), cell.pick_height_mm) for base in bases])
+    masks = np.stack([feasible(arm, base.to_local(points), cell.pick_height_mm) for base in bases])
     for array in (*axes, masks):
         array.setflags(write=False)
     return ManipulationGrid(axes[0], axes[1], masks, tuple(bases), float(cell.pick_height_mm))

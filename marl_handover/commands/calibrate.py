@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from marl_handover.cell import build_cell
-from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.commands.person import Person, confirmed
 from marl_handover.config import CellConfig, MotionConfig, require_between, require_choice, require_positive
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.settings import ARMS
 from marl_handover.runtime.settings import LabConfig
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.cell.kinematics import ArmModel
 from marl_handover.envs.cycle_check import Refusal
+from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.motion.trajectory import CyclePaths
 
 Floats = NDArray[np.float64]

@@ -63,8 +63,7 @@ class CollisionFinder:
 
     def _within_reach(self, arm: int, joints_rad: Floats) -> Floats:
         """Where the grip is (2,); at the edge of the annulus, if that is as far outside as the cycle check lets pass."""
-        base = self._cell.bases[arm]
-        centre = np.array([base.x_mm, base.y_mm])
+        centre = self._cell.bases[arm].position_mm
         gap = self._check.grip_mm(arm, joints_rad)[:2] - centre
         radius = float(np.hypot(*gap))
         return np.asarray(centre + gap / radius * min(max(radius, self._cell.r_min_mm), self._cell.r_max_mm))

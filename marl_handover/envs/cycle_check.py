@@ -105,15 +105,8 @@ class CycleCheck:
         return None
 
     def grip_mm(self, arm: int, joints_rad: Floats) -> Floats:
-        """World position (..., 3) of an arm's grip at joints (..., 5); the closed form of :meth:`ArmModel.fk`, without its matrices."""
-        geometry, base = self.model.arm, self.model.cell.bases[arm]
-        angle = np.cumsum(joints_rad[..., 1:4], -1)
-        cosine, sine = np.cos(angle), np.sin(angle)
-        links = np.stack([geometry.upper_arm_mm, geometry.forearm_mm, geometry.tool_mm])
-        forward = geometry.shoulder_mm[0] + cosine @ links[:, 0] - sine @ links[:, 1]
-        up = geometry.shoulder_mm[1] + sine @ links[:, 0] + cosine @ links[:, 1]
-        yaw = joints_rad[..., 0] + base.facing_rad
-        return np.stack([base.x_mm + forward * np.cos(yaw), base.y_mm + forward * np.sin(yaw), up], -1)
+        """World position (..., 3) of an arm's grip at joints (..., 5)."""
+        return self.model.cell.bases[arm].to_world(self.model.arm.grip_mm(joints_rad))
 
     def path_mm(self, arm: int, control_points: Floats) -> float:
         """Length of the grip's path along a spline (N, 5)."""

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from marl_handover.cell.kinematics import ArmModel
-from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import require_choice
 from marl_handover.errors import CorruptFile, HandoverError, InvalidSetting, MissingFile
 from marl_handover.files import keep, write_whole
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 
 Floats = NDArray[np.float64]

@@ -13,9 +13,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
-from marl_handover.cell.collision import capsule_pairs, joints_before
-from marl_handover.cell.urdf import ARM_JOINTS
-from marl_handover.motion.kernels import FAR_MM, beyond, nearest
+from marl_handover.geometry.capsules import capsule_pairs, joints_before
+from marl_handover.geometry.kernels import FAR_MM, beyond, nearest
+from marl_handover.geometry.urdf import ARM_JOINTS
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.cell.build import CellModel
-from marl_handover.cell.kinematics import LIMIT_TOLERANCE_RAD
-from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.errors import WorkFailed
+from marl_handover.geometry.arm_model import LIMIT_TOLERANCE_RAD
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration
 from marl_handover.hardware.clearance import alone_mm, arm_shapes, between_mm
 from marl_handover.hardware.settings import ARMS, HardwareConfig

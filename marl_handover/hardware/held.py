@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.cell.kinematics import LIMIT_TOLERANCE_RAD, ArmModel
-from marl_handover.cell.urdf import ARM_JOINTS
+from marl_handover.geometry.arm_model import LIMIT_TOLERANCE_RAD, ArmModel
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration
 from marl_handover.hardware.errors import BoardReset
 from marl_handover.hardware.gate import GateRejection, Reason

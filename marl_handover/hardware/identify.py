@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 
 from marl_handover.arrays import wrap
 from marl_handover.cell.build import CellModel
-from marl_handover.cell.urdf import ARM_JOINTS
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration, CalibrationProblem, ServoMap
 from marl_handover.hardware.settings import ARMS
 
@@ -152,15 +152,13 @@ def _misses(model: CellModel, arm: int, joints_rad: Floats, sightings: Sequence[
     """Predicted less seen: positions (n, 2) in mm, yaws (n,) in rad, 0 where none was seen."""
     base, T = model.cell.bases[arm], model.arm.fk(joints_rad)
     points = np.array([sighting.point_mm for sighting in sightings])
-    cos, sin = base.facing
-    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    at = (np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]) @ turn.T + np.array([base.x_mm, base.y_mm, 0.0])
+    at = base.to_world(np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3])
     cameras = np.array([sighting.camera_mm for sighting in sightings])
     planes = np.array([sighting.plane_mm for sighting in sightings])
     share = (planes - cameras[:, 2]) / (at[:, 2] - cameras[:, 2])
     projected = cameras[:, :2] + share[:, None] * (at[:, :2] - cameras[:, :2])
     predicted = np.where(np.isfinite(projected), projected, at[:, :2])
-    forward = T[:, :2, 0] @ turn[:2, :2].T
+    forward = base.matrix()[:2, :2] @ T[:, :2, 0].T
     yaws = np.array([sighting.yaw_rad for sighting in sightings])
-    off = wrap(np.arctan2(forward[:, 1], forward[:, 0]) - yaws)
+    off = wrap(np.arctan2(forward[1], forward[0]) - yaws)
     return predicted - np.array([sighting.seen_mm for sighting in sightings]), np.where(np.isfinite(off), off, 0.0)

@@ -11,9 +11,9 @@ import os
 import re
 from dataclasses import dataclass, field
 
-from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import require_at_least, require_between, require_choice, require_positive
 from marl_handover.errors import InvalidSetting
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.protocol import BAUDS, CHANNELS, PULSE_US
 from marl_handover.hardware.roll import user_path
 

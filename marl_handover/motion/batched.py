@@ -2,7 +2,7 @@
 
 The same bodies, pairs, clearances and lower edges of the held block, judged at a fixed number of samples of the path of the loaded hand,
 the other arm parked. What is not asked is the executors' lift-over profile: how high a block travels is a taste, not a collision.
-Geometry is in the arm's own vertical plane, as in :mod:`marl_handover.motion.kernels`; heights first, since they refuse most, and distances
+Geometry is in the arm's own vertical plane, as in :mod:`marl_handover.geometry.kernels`; heights first, since they refuse most, distances
 only where balls around the bodies come near enough to each other.
 """
 
@@ -16,6 +16,8 @@ from torch import Tensor
 
 from marl_handover.cell.build import CellModel
 from marl_handover.config import CentralisedConfig, MotionConfig
+from marl_handover.geometry.capsules import segment_distance
+from marl_handover.geometry.closed_form import pitch_frames
 from marl_handover.motion.body import out_of_reach
 from marl_handover.motion.objective import first_moving
 from marl_handover.motion.planner import STILL_MM, MotionPlanner
@@ -136,18 +138,10 @@ class MotionCheck:
 
     def _frames(self, joints: Tensor) -> Frames:
         """Of joint samples (n, S, 4)."""
-        planar = [float(value) for value in self.planar[:8]]
-        angle = joints[..., 1:].cumsum(-1)
-        cos, sin = angle.cos(), angle.sin()
-        zero = torch.zeros_like(cos[..., 0])
-        r, z = [zero, zero, zero + planar[0]], [zero, zero, zero + planar[1]]
-        for level in range(2):
-            x, y = planar[2 + 2 * level], planar[3 + 2 * level]
-            r.append(r[-1] + cos[..., level] * x - sin[..., level] * y)
-            z.append(z[-1] + sin[..., level] * x + cos[..., level] * y)
-        one = (zero + 1)[..., None].expand(*zero.shape, 2)
-        cosines, sines = torch.cat([one, cos], -1), torch.cat([0 * one, sin], -1)
-        return Frames(torch.stack(r, -1), torch.stack(z, -1), cosines, sines, joints[..., 0].cos(), joints[..., 0].sin())
+        r, z, cos, sin = pitch_frames(self.planar, joints)
+        standing = torch.zeros_like(r[..., :2])  # base and turret do not pitch
+        r, z, cos, sin = (torch.cat(pair, -1) for pair in ((standing, r), (standing, z), (standing + 1, cos), (standing, sin)))
+        return Frames(r, z, cos, sin, joints[..., 0].cos(), joints[..., 0].sin())
 
     def _heights(self, frames: Frames, ends: Ends) -> Tensor:
         """Whether every moving body is clear of the table, and the block's lower edges as high as they must be, bool (n,)."""
@@ -232,20 +226,6 @@ def nearer(first: Tensor, second: Tensor, clearance_mm: float) -> Tensor:
     """Whether segments (m, 8), see :func:`_segments`, are nearer to each other than their radii and the clearance allow, bool (m,)."""
     one, other = first.double(), second.double()
     return segment_distance(one[:, :3], one[:, 3:6], other[:, :3], other[:, 3:6]) < one[:, 6] + other[:, 6] + clearance_mm
-
-
-def segment_distance(start_1: Tensor, end_1: Tensor, start_2: Tensor, end_2: Tensor) -> Tensor:
-    """Distance (...) between segments (..., 3), as :func:`marl_handover.cell.collision.segment_distance`."""
-    d1, d2, gap = end_1 - start_1, end_2 - start_2, start_1 - start_2
-    a, e, b = (d1 * d1).sum(-1), (d2 * d2).sum(-1), (d1 * d2).sum(-1)
-    c, f = (d1 * gap).sum(-1), (d2 * gap).sum(-1)
-    determinant = a * e - b * b
-    skew = determinant > 1e-12 * a * e
-    one = torch.ones_like(a)
-    s = torch.where(skew, ((b * f - c * e) / torch.where(skew, determinant, one)).clamp(0.0, 1.0), 0.0)
-    t = torch.where(e > 0, ((b * s + f) / torch.where(e > 0, e, one)).clamp(0.0, 1.0), 0.0)
-    s = torch.where(a > 0, ((b * t - c) / torch.where(a > 0, a, one)).clamp(0.0, 1.0), 0.0)
-    return (gap + s[..., None] * d1 - t[..., None] * d2).square().sum(-1).sqrt()
 
 
 def _segments(frames: Frames, capsules: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from marl_handover.arrays import select
 from marl_handover.cell import Cell
 from marl_handover.cell.build import CellModel
 from marl_handover.config import CentralisedConfig, MotionConfig
+from marl_handover.geometry.closed_form import planar_ik
 from marl_handover.motion.batched import Ends
 from marl_handover.motion.body import arm_body
 from marl_handover.motion.splines import sampled_basis
@@ -52,7 +53,7 @@ class MotionNumbers:
     def __init__(self, model: CellModel, motion: MotionConfig, settings: CentralisedConfig) -> None:
         body = arm_body(model, motion)
         self.settings, self.motion = settings, motion
-        self.planar = [float(value) for value in body.planar[:8]]
+        self.planar = model.arm.planar
         self.pick_height_mm = float(model.cell.config.pick_height_mm)
         self.count = JOINTS * (settings.control_points - 2)
         self.limits = torch.tensor(body.limits, dtype=torch.float32)
@@ -108,12 +109,4 @@ class MotionNumbers:
 
     def _elbow_up(self, radius: Tensor, height: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
         """Joints (..., 4) with the grip at radius and height in mm and this pitch; NaN out of reach."""
-        r0, z0, upper_r, upper_z, fore_r, fore_z, tool_r, tool_z = self.planar
-        upper, fore = math.hypot(upper_r, upper_z), math.hypot(fore_r, fore_z)
-        slope_1, slope_2 = math.atan2(upper_z, upper_r), math.atan2(fore_z, fore_r)
-        cos, sin = pitch.cos(), pitch.sin()
-        x, z = radius - (cos * tool_r - sin * tool_z) - r0, height - (sin * tool_r + cos * tool_z) - z0
-        bend = -((x * x + z * z - upper**2 - fore**2) / (2 * upper * fore)).arccos()
-        shoulder = torch.atan2(z, x) - torch.atan2(fore * bend.sin(), upper + fore * bend.cos()) - slope_1
-        elbow = bend + slope_1 - slope_2
-        return torch.stack([yaw, shoulder, elbow, pitch - shoulder - elbow], -1)
+        return torch.cat([yaw[..., None], planar_ik(self.planar, radius, height, pitch, -1)], -1)

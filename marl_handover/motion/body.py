@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
-from marl_handover.cell.collision import Capsule, capsule_pairs, joints_before
-from marl_handover.cell.kinematics import ArmModel, transform
 from marl_handover.config import BlockConfig, MotionConfig
-from marl_handover.motion.kernels import can_meet, world_shapes
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.capsules import Capsule, capsule_pairs, joints_before
+from marl_handover.geometry.kernels import can_meet, world_shapes
+from marl_handover.geometry.se3 import apply, flat_pose
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -28,7 +29,7 @@ SPOKES = 3
 
 @dataclass(frozen=True, eq=False)
 class ArmBody:
-    """The packed shapes of one arm, bare and holding the block; layouts as in :mod:`marl_handover.motion.kernels`.
+    """The packed shapes of one arm, bare and holding the block; layouts as in :mod:`marl_handover.geometry.kernels`.
 
     ``pairs`` index capsules that must not touch and might, within the joint ``limits`` (4, 2); the others are proved apart. ``edges``
     (2, 2) are the held block's lower front and rear edge in the wrist's frame. ``reach_mm``: nothing of the arm, or held by it, is ever
@@ -49,7 +50,7 @@ class ArmBody:
 def arm_body(model: CellModel, motion: MotionConfig) -> ArmBody:
     """The shapes of a cell's arm, its fingers opened by ``finger_travel_mm``."""
     arm = model.arm
-    planar = np.concatenate([arm.shoulder_mm, arm.upper_arm_mm, arm.forearm_mm, arm.tool_mm])
+    planar = arm.planar
     shapes, first, second = capsule_pairs(arm.description)
     pivots = np.array([[0.0, 0.0], [0.0, 0.0], arm.shoulder_mm, arm.shoulder_mm + arm.upper_arm_mm])
     pivots = np.concatenate([pivots, [pivots[3] + arm.forearm_mm]])
@@ -59,7 +60,7 @@ def arm_body(model: CellModel, motion: MotionConfig) -> ArmBody:
     for shape in shapes:
         level = min(before[shape.link], 4)
         T_base_link = frames[shape.link]
-        ends = [T_base_link[:3, :3] @ np.array(end) + T_base_link[:3, 3] for end in (shape.start_mm, shape.end_mm)]
+        ends = [apply(T_base_link, end) for end in (shape.start_mm, shape.end_mm)]
         offset = np.array([pivots[level][0], 0.0, pivots[level][1]])
         rows.append([level, *(ends[0] - offset), *(ends[1] - offset), shape.radius_mm])
     shaped = _with_half_lengths([_standing(row) if row[0] == 0 else row for row in rows], 1)
@@ -125,11 +126,11 @@ def standing_arm(body: ArmBody, arm: ArmModel, motion: MotionConfig, q: Floats, 
         rows[:, :6], rows[:, 6], rows[:, 7], rows[:, 8] = shapes[:, :6], shapes[:, 10], motion.arm_clearance_mm, shapes[:, 9]
         return rows
     frames = arm.link_transforms(q, motion.finger_travel_mm)
-    T = transform((x_mm, y_mm, 0.0), (0.0, 0.0, facing_rad))
+    T = flat_pose(x_mm, y_mm, facing_rad)
     listed = []
     for shape in capsule_pairs(arm.description)[0]:
         M = T @ frames[shape.link]
-        ends = [M[:3, :3] @ np.array(end) + M[:3, 3] for end in (shape.start_mm, shape.end_mm)]
+        ends = [apply(M, end) for end in (shape.start_mm, shape.end_mm)]
         listed.append([*ends[0], *ends[1], shape.radius_mm, motion.arm_clearance_mm])
     return _with_half_lengths(listed, 0)
 

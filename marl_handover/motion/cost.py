@@ -223,12 +223,7 @@ def build_table(cell: Cell, motion: MotionConfig, *, progress: bool = True) -> C
 
 def _places(cell: Cell, middle_rad: float, first_mm: float, second_mm: float, between_rad: float) -> tuple[Floats, Floats]:
     """World positions (2,) of two places at these radii of the first arm, symmetric about ``middle_rad`` of its yaw."""
-    base = cell.bases[0]
-    angles = base.facing_rad + middle_rad + np.array([-0.5, 0.5]) * between_rad
-    first, second = (
-        np.array([base.x_mm + radius * math.cos(angle), base.y_mm + radius * math.sin(angle)])
-        for radius, angle in zip((first_mm, second_mm), angles, strict=True)
-    )
+    first, second = cell.bases[0].around((first_mm, second_mm), middle_rad + np.array([-0.5, 0.5]) * between_rad)
     return first, second
 
 

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.cell.kinematics import ArmModel
-from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import MotionConfig, require_between, require_positive
 from marl_handover.errors import InvalidSetting
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.timing import TimedPath, time_path
 from marl_handover.motion.trajectory import CyclePaths, Phase
 

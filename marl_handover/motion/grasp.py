@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.cell import CellModel
-from marl_handover.cell.spaces import points_in_base
 from marl_handover.motion.trajectory import OutOfArmsReach
 
 Floats = NDArray[np.float64]
@@ -22,7 +21,7 @@ def level_joints(model: CellModel, arm: int, what: str, position_mm: Floats) -> 
         OutOfArmsReach: no joint vector within the limits does it.
     """
     base, arm_model = model.cell.bases[arm], model.arm
-    x, y = points_in_base(position_mm, (base.x_mm, base.y_mm, base.facing_rad))
+    x, y = base.to_local(position_mm)
     q = arm_model.ik(np.array([x, y, model.cell.config.pick_height_mm]))
     inside = np.clip(q, arm_model.lower_rad, arm_model.upper_rad)
     good = (np.abs(q - inside) <= EDGE_RAD).all(axis=-1)  # NaN, out of reach, is not

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marl_handover.motion.kernels import FAR_MM, beyond, nearest, world_shapes
+from marl_handover.geometry.kernels import FAR_MM, beyond, nearest, world_shapes
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import Phase, TransferMotion
 

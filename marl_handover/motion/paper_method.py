@@ -20,7 +20,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from marl_handover.motion.kernels import elbow_up
+from marl_handover.geometry.closed_form import grip_in_plane, grip_speed
+from marl_handover.geometry.kernels import elbow_up
 from marl_handover.motion.scene import Scene
 from marl_handover.motion.segment import DENSE_SAMPLES, FoundPath, NoPath, Segment, refuse_bad_ends
 from marl_handover.motion.splines import sampled_basis
@@ -98,22 +99,12 @@ def first_guess(segment: Segment) -> Floats:
     """Control points (7, 5): the line in joint space, the inner ones raised by the lift where the arm reaches that far."""
     t = np.linspace(0.0, 1.0, CONTROL_POINTS)[:, None]
     line = segment.ends[0] + (segment.ends[1] - segment.ends[0]) * t
-    r, z = _grip(segment.scene.planar, line)
+    r, z = grip_in_plane(segment.scene.planar, line)
     raised = np.empty((CONTROL_POINTS, 3))
     elbow_up(segment.scene.planar, r, z + segment.scene.profile[6] * (t[:, 0] > 0.0) * (t[:, 0] < 1.0), line[:, 1:].sum(axis=1), raised)
     pitches = np.where(np.isnan(raised), line[:, 1:], raised)
     inner = np.clip(pitches, segment.body.limits[1:, 0], segment.body.limits[1:, 1])
     return np.concatenate([line[:, :1], inner, np.zeros((CONTROL_POINTS, 1))], axis=1)
-
-
-def grip_speed(planar: Floats, q: Floats, slope: Floats) -> Floats:
-    """Speed (S,) of the grip in mm per unit of tau, of joints ``q`` (S, 5) that change by ``slope`` (S, 5)."""
-    angles, turning = np.cumsum(q[:, 1:4], axis=1), np.cumsum(slope[:, 1:4], axis=1)
-    c, s = np.cos(angles), np.sin(angles)
-    x, z = planar[2:8:2], planar[3:8:2]
-    along, up = c * x - s * z, s * x + c * z
-    r = planar[0] + along.sum(axis=1)
-    return np.asarray(np.sqrt((r * slope[:, 0]) ** 2 + (up * turning).sum(axis=1) ** 2 + (along * turning).sum(axis=1) ** 2))
 
 
 @njit(cache=True, nogil=True)
@@ -123,19 +114,11 @@ def sample_margins(Q: Floats, scene: Scene, out: Floats) -> None:
         dense_margins(Q[i : i + 1], scene, out[i])
 
 
-def _grip(planar: Floats, q: Floats) -> tuple[Floats, Floats]:
-    """Radius and height (S,) of the grip in mm, of joints (S, >= 4)."""
-    angles = np.cumsum(q[:, 1:4], axis=1)
-    c, s = np.cos(angles), np.sin(angles)
-    x, z = planar[2:8:2], planar[3:8:2]
-    return planar[0] + (c * x - s * z).sum(axis=1), planar[1] + (s * x + c * z).sum(axis=1)
-
-
 def _pose_errors(segment: Segment, points: Floats) -> Floats:
     """How far both ends (2, 5) are from their poses: x, y, z in mm, pitch and roll in rad."""
 
     def poses(q: Floats) -> Floats:
-        r, z = _grip(segment.scene.planar, q)
+        r, z = grip_in_plane(segment.scene.planar, q)
         return np.stack([r * np.cos(q[:, 0]), r * np.sin(q[:, 0]), z, q[:, 1:4].sum(axis=1)], axis=1)
 
     ends = points[[0, -1]]

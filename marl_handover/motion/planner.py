@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.cell.build import CellModel
-from marl_handover.cell.spaces import points_in_base
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed
 from marl_handover.motion.body import arm_body, ball_around, standing_arm, standing_block
@@ -94,10 +93,7 @@ class MotionPlanner:
         notice.start()
         try:
             cell = self.model.cell
-            radius = (cell.r_min_mm + cell.r_max_mm) / 2
-            base = cell.bases[0]
-            places = [base.facing_rad + turn for turn in (-0.3, 0.3)]
-            pick, place = ([base.x_mm + radius * math.cos(angle), base.y_mm + radius * math.sin(angle)] for angle in places)
+            pick, place = cell.bases[0].around((cell.r_min_mm + cell.r_max_mm) / 2, (-0.3, 0.3))
             with suppress(WorkFailed):  # settings under which nothing can move are for the first real command to name
                 self.cycle(0, pick, place, self.parked_rad, self.parked_rad)
         finally:
@@ -166,8 +162,7 @@ class MotionPlanner:
 
     def in_base(self, arm: int, position_mm: Floats) -> Floats:
         """A world position (2,) in the frame of an arm's base."""
-        base = self.model.cell.bases[arm]
-        return points_in_base(position_mm, (base.x_mm, base.y_mm, base.facing_rad))
+        return self.model.cell.bases[arm].to_local(position_mm)
 
     def _other(self, arm: int, joints_rad: Floats) -> Floats:
         """Obstacle rows of every other arm, all at the same joints."""
@@ -180,7 +175,7 @@ class MotionPlanner:
             if index == arm:
                 continue
             turn = base.facing_rad - bases[arm].facing_rad
-            x_mm, y_mm = self.in_base(arm, np.array([base.x_mm, base.y_mm]))
+            x_mm, y_mm = self.in_base(arm, base.position_mm)
             rows.append(standing_arm(self.body, self.model.arm, self.motion, joints_rad, float(x_mm), float(y_mm), turn))
         self._standing = (key, np.concatenate(rows))
         return self._standing[1]

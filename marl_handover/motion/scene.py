@@ -12,7 +12,7 @@ Ints = NDArray[np.int64]
 
 
 class Scene(NamedTuple):
-    """One arm, what it holds and what stands around it. Lengths in mm; layouts of the rows: :mod:`marl_handover.motion.kernels`.
+    """One arm, what it holds and what stands around it. Lengths in mm; layouts of the rows: :mod:`marl_handover.geometry.kernels`.
 
     Attributes:
         planar: (14,) the arm's links.

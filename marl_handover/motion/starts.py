@@ -9,8 +9,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.geometry.kernels import elbow_up
 from marl_handover.motion.body import ArmBody
-from marl_handover.motion.kernels import elbow_up
 from marl_handover.motion.splines import basis, sampled_basis
 
 Floats = NDArray[np.float64]

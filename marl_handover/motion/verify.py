@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marl_handover.motion.kernels import FAR_MM, at_wrist, beyond, hand_ball, hand_is_away, nearest, pivots, place_capsules, turned
+from marl_handover.geometry.kernels import FAR_MM, at_wrist, beyond, hand_ball, hand_is_away, nearest, pivots, place_capsules, turned
 from marl_handover.motion.objective import first_moving, ramp
 from marl_handover.motion.scene import Scene
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import json
-import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -195,11 +194,3 @@ def hung_camera(mount: MountConfig, size_px: tuple[int, int]) -> CameraCalibrati
     mount.validate()
     lens = Intrinsics.pinhole(mount.focal_px, size_px)
     return CameraCalibration(lens, looking_down(mount.eye_mm, mount.tilt_deg, mount.turn_deg))
-
-
-def flat_pose(x_mm: float, y_mm: float, yaw_rad: float, z_mm: float = 0.0) -> Floats:
-    """T_world_sheet (4, 4) of something that lies flat."""
-    T = np.eye(4)
-    T[:2, :2] = [[math.cos(yaw_rad), -math.sin(yaw_rad)], [math.sin(yaw_rad), math.cos(yaw_rad)]]
-    T[:3, 3] = x_mm, y_mm, z_mm
-    return T

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from marl_handover.errors import CorruptFile
-from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels, flat_pose
+from marl_handover.geometry.se3 import flat_pose
+from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels
 
 QUALITY = 80
 _THIN_PX, _THICK_PX, _LETTERS = 2, 5, 0.8

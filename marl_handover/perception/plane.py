@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from marl_handover.perception.calibration import CalibrationFailed, CameraCalibration, Floats, Intrinsics, Pixels, flat_pose
+from marl_handover.geometry.se3 import apply, flat_pose
+from marl_handover.perception.calibration import CalibrationFailed, CameraCalibration, Floats, Intrinsics, Pixels
 from marl_handover.perception.intrinsics import BoardFinder
 from marl_handover.perception.markers import MarkerFinder
 from marl_handover.perception.settings import BoardConfig
@@ -137,9 +138,7 @@ def _with_slack(lens: Intrinsics, world: Sequence[Floats], pixels: Sequence[Floa
 def _shifted(points: Floats, x_mm: float, y_mm: float, yaw_rad: float) -> Floats:
     """Points (n, 3) of the table, turned about their middle and shifted."""
     middle = points.mean(axis=0)
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray((points - middle) @ turn.T + middle + (x_mm, y_mm, 0.0))
+    return apply(flat_pose(x_mm, y_mm, yaw_rad), points - middle) + middle
 
 
 def _solve(lens: Intrinsics, world_mm: Floats, pixels: Floats) -> Floats:

@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 
 from marl_handover.cell.build import CellModel
 from marl_handover.cell.cell import Base
-from marl_handover.cell.kinematics import ArmModel, transform
-from marl_handover.cell.urdf import Primitive
 from marl_handover.config import BlockConfig
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.se3 import flat_pose, transform
+from marl_handover.geometry.urdf import Primitive
 from marl_handover.perception.boards import Sheet, block_top, marker_sheet
-from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels, flat_pose
+from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels
 from marl_handover.perception.renderer import Colour, Renderer, Shape
 from marl_handover.perception.settings import LookConfig, TargetConfig
 
@@ -64,7 +65,7 @@ def block_shapes(block: BlockConfig, T_world_block: Floats, eye_mm: Floats, top:
 
 def arm_shapes(arm: ArmModel, base: Base, joints_rad: ArrayLike, gripper_mm: float | None = None) -> list[Shape]:
     """An arm, as its URDF's collision shapes, at joints (5,); ``gripper_mm``: how far each finger is from closed, None: open."""
-    T_world_base = flat_pose(base.x_mm, base.y_mm, base.facing_rad)
+    T_world_base = base.matrix()
     frames = arm.link_transforms(np.asarray(joints_rad, dtype=float), gripper_mm)
     shapes = []
     for link in arm.description.links:

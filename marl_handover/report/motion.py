@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import MotionConfig
 from marl_handover.errors import CorruptFile, InvalidSetting
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.trajectory import PHASES, CyclePaths, Phase, TransferMotion
 from marl_handover.report.palette import BLUE, FAINT, GREY, INK, PAPER, RED, YELLOW, arm_colour
 from marl_handover.report.table import Axes, draw_bases, draw_sectors, frame_table

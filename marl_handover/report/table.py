@@ -25,7 +25,7 @@ def sector_mm(cell: Cell, arm: int, points: int = 90) -> Floats:
     base = cell.bases[arm]
     angle = base.facing_rad + np.linspace(*cell.yaw_rad, points)
     ray = np.stack([np.cos(angle), np.sin(angle)], -1)
-    return np.array([base.x_mm, base.y_mm]) + np.concatenate([cell.r_max_mm * ray, cell.r_min_mm * ray[::-1]])
+    return base.position_mm + np.concatenate([cell.r_max_mm * ray, cell.r_min_mm * ray[::-1]])
 
 
 def frame_table(axes: Axes, cell: Cell, margin_mm: float = 25.0) -> None:

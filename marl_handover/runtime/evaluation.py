@@ -85,7 +85,7 @@ def _errors(transfers: Sequence[Transfer], rules: Rules) -> tuple[Floats, Floats
     arms = np.array([transfer.order.arm for transfer in transfers])
     reached = np.stack([transfer.done.true for transfer in transfers])
     predicted = np.stack([transfer.order.predicted for transfer in transfers])
-    bases = np.array([(base.x_mm, base.y_mm) for base in rules.cell.bases])[arms]
+    bases = np.array([base.position_mm for base in rules.cell.bases])[arms]
     ray = predicted[:, :2] - bases
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     left = np.stack([-ray[:, 1], ray[:, 0]], -1)

@@ -185,10 +185,9 @@ class Mishaps:
 
     def _clear(self, pose: Floats) -> bool:
         """Whether no arm is at a block at ``pose`` (3,), nor over it."""
-        for base, T in zip(self.rules.cell.bases, self.twin.model.arm.fk(self.twin.true_joints_rad()), strict=True):
-            foot, (cos, sin), (forward, aside, height_mm) = np.array([base.x_mm, base.y_mm]), base.facing, T[:3, 3]
-            grip = foot + (forward * cos - aside * sin, forward * sin + aside * cos)
-            if height_mm < _ABOVE_MM and _apart_mm(pose[:2], foot, grip) < _CLEAR_MM:
+        for base, reached in zip(self.rules.cell.bases, self.twin.model.arm.grip_mm(self.twin.true_joints_rad()), strict=True):
+            grip = base.to_world(reached)
+            if grip[2] < _ABOVE_MM and _apart_mm(pose[:2], base.position_mm, grip[:2]) < _CLEAR_MM:
                 return False
         return True
 

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
-from marl_handover.cell.collision import Capsule, capsule_pairs, ground_clearance_mm, segment_distance
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import MotionConfig
 from marl_handover.errors import WorkFailed
+from marl_handover.geometry.capsules import Capsule, capsule_pairs, ground_clearance_mm, segment_distance
+from marl_handover.geometry.se3 import apply
 from marl_handover.motion.body import block_capsules
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import TransferMotion
@@ -63,7 +64,7 @@ def motion_row(motion: TransferMotion) -> dict[str, Any]:
 
 def grip_mm(model: CellModel, arm: int, joints_rad: Floats) -> Floats:
     """World position (..., 3) of an arm's grip."""
-    return _to_world(model, arm, model.arm.fk(joints_rad)[..., :3, 3])
+    return model.cell.bases[arm].to_world(model.arm.grip_mm(joints_rad))
 
 
 def clearances_mm(model: CellModel, settings: MotionConfig, motion: TransferMotion) -> tuple[Floats, Floats]:
@@ -90,21 +91,10 @@ def _capsules(model: CellModel, settings: MotionConfig, arm: int, joints_rad: Fl
     if holding:
         config = model.cell.config
         pieces += [(model.arm.fk(joints_rad), capsule) for capsule in block_capsules(config.block, config.pick_height_mm)]
-    return [(_to_world(model, arm, _point(T, c.start_mm)), _to_world(model, arm, _point(T, c.end_mm)), c.radius_mm) for T, c in pieces]
+    world = model.cell.bases[arm].to_world
+    return [(world(apply(T, c.start_mm)), world(apply(T, c.end_mm)), c.radius_mm) for T, c in pieces]
 
 
 def _least_gap(own: _Shapes, other: _Shapes) -> Floats:
     gaps = [segment_distance(a, b, c, d) - (r + s) for a, b, r in own for c, d, s in other]
     return np.min(gaps, axis=0)
-
-
-def _point(T: Floats, point_mm: Sequence[float]) -> Floats:
-    return np.asarray(T[..., :3, :3] @ np.asarray(point_mm, float) + T[..., :3, 3])
-
-
-def _to_world(model: CellModel, arm: int, point_mm: Floats) -> Floats:
-    """Points (..., 3) of an arm's base frame in the world's."""
-    base = model.cell.bases[arm]
-    cos, sin = base.facing
-    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(point_mm @ turn.T + np.array([base.x_mm, base.y_mm, 0.0]))

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import require_between
 from marl_handover.errors import CorruptFile, MissingFile
 from marl_handover.files import write_whole
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration
 from marl_handover.hardware.settings import ARMS
 from marl_handover.motion.trajectory import Phase

@@ -22,7 +22,7 @@ def drawn_in(cell: Cell, pose: Floats, edge_mm: float) -> Floats:
         return pose
     radius = np.clip(np.sqrt(square), cell.r_min_mm, cell.r_max_mm)
     angle = cell.gripper_yaw(np.clip(yaw, *cell.yaw_rad))
-    bases = np.array([(base.x_mm, base.y_mm) for base in cell.bases])
+    bases = np.array([base.position_mm for base in cell.bases])
     places = bases + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     away = np.hypot(*(places - pose[:2]).T)
     nearest = int(away.argmin())

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.cell.kinematics import transform
+from marl_handover.geometry.se3 import transform
 from marl_handover.hardware.calibration import ArmCalibration, CalibrationProblem
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.gate import GateRejection, JointCommand
 from marl_handover.hardware.identify import LEAST_SIGHTINGS, Sighting, identify
 from marl_handover.hardware.settings import ARMS
-from marl_handover.perception.calibration import CameraCalibration, Pixels, flat_pose
+from marl_handover.perception.calibration import CameraCalibration, Pixels
 from marl_handover.perception.camera import Camera
 from marl_handover.perception.markers import MarkerFinder
 from marl_handover.perception.settings import TargetConfig
@@ -156,7 +156,7 @@ class ServoCalibration:
         grip = model.arm.fk(q)
         radius = np.hypot(grip[:, 0, 3], grip[:, 1, 3])
         room = (grip[:, 2, 3] > _HEIGHT_MM[0]) & (grip[:, 2, 3] < _HEIGHT_MM[1]) & (radius > _RADIUS_MM[0]) & (radius < _RADIUS_MM[1])
-        card = flat_pose(base.x_mm, base.y_mm, base.facing_rad) @ grip @ transform(tuple(self.cards.place_mm), (0.0, 0.0, 0.0))
+        card = base.matrix() @ grip @ transform(tuple(self.cards.place_mm), (0.0, 0.0, 0.0))
         away = self.seen_by.eye_mm() - card[:, :3, 3]
         facing = np.einsum("ni,ni->n", card[:, :3, 2], away) / np.linalg.norm(away, axis=1) > _FACING_UP
         pixels = self.seen_by.project(card[:, :3, 3])

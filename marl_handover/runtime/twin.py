@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.cell.build import CellModel
-from marl_handover.cell.kinematics import transform
 from marl_handover.config import MotionConfig
+from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.emulator.cell import EmulatedCell
 from marl_handover.hardware.emulator.faults import Fault
 from marl_handover.perception.boards import Sheet, marker_sheet
-from marl_handover.perception.calibration import Pixels, flat_pose, hung_camera
+from marl_handover.perception.calibration import Pixels, hung_camera
 from marl_handover.perception.camera import Frame, RenderedCamera
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.runtime.reach import drawn_in
@@ -169,7 +169,7 @@ class Twin:
         fingers = [arm.gripper_mm() for arm in self.cell.arms]
         sheets = list(self._sheets)
         for base, q, (card, T_grip_card) in zip(self.model.cell.bases, joints, self._cards, strict=False):
-            sheets.append((card, flat_pose(base.x_mm, base.y_mm, base.facing_rad) @ self.model.arm.fk(q) @ T_grip_card))
+            sheets.append((card, base.matrix() @ self.model.arm.fk(q) @ T_grip_card))
         block = None if now_s < self.hidden_until_s or self._sheets else self.cell.block.transform()
         return self.painter.picture(block, joints, self.goal, fingers, sheets)
 

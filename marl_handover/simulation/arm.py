@@ -8,8 +8,8 @@ import numpy as np
 
 from marl_handover.cell.build import urdf_path
 from marl_handover.cell.cell import Base
-from marl_handover.cell.kinematics import ArmModel
-from marl_handover.cell.urdf import ARM_JOINTS
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.simulation.engine import Engine, Floats, Surface, force, length, pybullet, to_mm, torque
 
 GRIP_FORCE_N = 2.0

@@ -34,7 +34,7 @@ def _sector_mm(cell: Cell, arm: int) -> tuple[Floats, Floats]:
     base = cell.bases[arm]
     angle = base.facing_rad + np.linspace(*cell.yaw_rad, _STRIP)
     ray = np.stack([np.cos(angle), np.sin(angle)], -1)
-    at = np.array([base.x_mm, base.y_mm])
+    at = base.position_mm
     return at + cell.r_min_mm * ray, at + cell.r_max_mm * ray
 
 

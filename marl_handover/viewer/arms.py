@@ -9,8 +9,8 @@ import viser
 from numpy.typing import NDArray
 
 from marl_handover.cell import CellModel
-from marl_handover.cell.kinematics import transform
-from marl_handover.cell.urdf import ARM_JOINTS, Joint, Primitive
+from marl_handover.geometry.se3 import transform
+from marl_handover.geometry.urdf import ARM_JOINTS, Joint, Primitive
 from marl_handover.palette import INK, arm_colour
 from marl_handover.viewer.units import UPWARDS, metres, product, quaternion, rgb, turned
 

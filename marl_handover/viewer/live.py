@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from marl_handover.cell import CellModel, build_cell
 from marl_handover.cell.cell import Cell
-from marl_handover.cell.kinematics import transform
 from marl_handover.config import BlockConfig, CellConfig
 from marl_handover.errors import HandoverError
-from marl_handover.perception.calibration import flat_pose
+from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.runtime.feed import Feed, Reading
 from marl_handover.runtime.steering import MAX_AGE_S, Ask
 from marl_handover.viewer import live_words
@@ -170,7 +169,7 @@ class LivePage:
         holder = next((index for index, arm in enumerate(state["arms"]) if arm["holding"] and arm["joints_rad"] is not None), None)
         if holder is not None:
             base = model.cell.bases[holder]
-            T_world_base = flat_pose(base.x_mm, base.y_mm, base.facing_rad)
+            T_world_base = base.matrix()
             now = T_world_base @ model.arm.fk(np.array(state["arms"][holder]["joints_rad"], float))
             self._held = now @ np.linalg.inv(_picking(model.cell, holder, pose)) @ flat_pose(*pose)
             return self._held

@@ -25,7 +25,7 @@ def within_reach(cell: Cell, pose: Floats) -> Floats:
 def _of_sector(cell: Cell, arm: int, point_mm: Floats) -> Floats:
     """Points (n, 2) of one arm's annulus sector, the nearest to ``point_mm`` among them: on its arcs, its straight edges, its corners."""
     base = cell.bases[arm]
-    centre, (low, high) = np.array([base.x_mm, base.y_mm]), cell.yaw_rad
+    centre, (low, high) = base.position_mm, cell.yaw_rad
     square, yaw = (float(value[arm]) for value in cell.polar(point_mm))
     radius = math.sqrt(square)
     at = [(float(np.clip(radius, cell.r_min_mm, cell.r_max_mm)), float(np.clip(yaw, low, high)))]

@@ -51,7 +51,7 @@ def sector_outline(cell: Cell, arm: int) -> Floats:
     angles = base.facing_rad + np.linspace(low, high, _POINTS)
     rays = np.stack([np.cos(angles), np.sin(angles)], -1)
     around = np.concatenate([cell.r_max_mm * rays, cell.r_min_mm * rays[::-1], cell.r_max_mm * rays[:1]])
-    return np.array([base.x_mm, base.y_mm]) + around
+    return base.position_mm + around
 
 
 def shared_mesh(cell: Cell) -> tuple[Floats, NDArray[np.uint32]]:

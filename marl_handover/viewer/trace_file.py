@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.task.rules import Outcome
 
 Floats = NDArray[np.float64]

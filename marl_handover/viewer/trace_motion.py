@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.cell import CellModel
-from marl_handover.cell.kinematics import transform
 from marl_handover.config import MotionConfig
 from marl_handover.errors import HandoverError
 from marl_handover.motion.grasp import level_joints
@@ -129,7 +128,6 @@ class Motions:
         first = int(inside[0]) if len(inside) else len(own)
         T[: min(first, len(own) - 1)] = lying(step.state)
         if len(inside):
-            base = self.model.cell.bases[step.arm]
-            T_world_grip = transform((base.x_mm, base.y_mm, 0.0), (0.0, 0.0, base.facing_rad)) @ self.model.arm.fk(own)
+            T_world_grip = self.model.cell.bases[step.arm].matrix() @ self.model.arm.fk(own)
             T[held] = T_world_grip[held] @ np.linalg.inv(T_world_grip[first]) @ lying(step.state)
         return T

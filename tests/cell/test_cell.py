@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from marl_handover.cell import LEFT, RIGHT, build_cell, cell_config
-from marl_handover.cell.kinematics import transform
+from marl_handover.geometry.se3 import transform
 from marl_handover.task.problems import sample_positions
 from marl_handover.task.rules import Command
 

@@ -9,28 +9,33 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from marl_handover.cell.collision import ground_clearance_mm, self_clearance_mm
-from marl_handover.cell.kinematics import ArmModel
-from marl_handover.cell.spaces import BasePose, ManipulationGrid, feasible, fit_annulus, manipulation_grid, points_in_base
-from marl_handover.cell.urdf import read_urdf
+from marl_handover.cell.spaces import ManipulationGrid, feasible, fit_annulus, manipulation_grid
 from marl_handover.config import CellConfig
 from marl_handover.errors import InvalidSetting
+from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
+from marl_handover.geometry.closed_form import ClosedFormArm
+from marl_handover.geometry.se2 import SE2
+from marl_handover.geometry.urdf import read_urdf
 from marl_handover.resources import resource_path
 
 DESCRIPTION = read_urdf(resource_path("urdf/al5a.urdf"))
 PAPER = {"base_yaw": [-90, 90], "shoulder": [-14, 150], "elbow": [-168, -108.5], "wrist_pitch": [-95, 95], "wrist_roll": [-90, 90]}
 AL5A = {"base_yaw": [-95, 95], "shoulder": [-14, 150], "elbow": [-167, 0], "wrist_pitch": [-95, 100], "wrist_roll": [-90, 90]}
-PAPER_ARM = ArmModel(DESCRIPTION, PAPER)
+PAPER_ARM = ClosedFormArm(DESCRIPTION, PAPER)
 
 
-def pair(base_distance_mm: float) -> list[BasePose]:
+def base_at(x_mm: float, y_mm: float, facing_rad: float) -> SE2:
+    return SE2(x_mm, y_mm, (math.cos(facing_rad), math.sin(facing_rad)))
+
+
+def pair(base_distance_mm: float) -> list[SE2]:
     half = base_distance_mm / 2
-    return [(0.0, half, -math.pi / 2), (0.0, -half, math.pi / 2)]
+    return [base_at(0.0, half, -math.pi / 2), base_at(0.0, -half, math.pi / 2)]
 
 
 def build(limits: dict[str, list[float]], base_distance_mm: float, pick_height_mm: float = 45.0) -> ManipulationGrid:
     cell = CellConfig(base_distance_mm=base_distance_mm, pick_height_mm=pick_height_mm)
-    return manipulation_grid(ArmModel(DESCRIPTION, limits), cell, pair(base_distance_mm))
+    return manipulation_grid(ClosedFormArm(DESCRIPTION, limits), cell, pair(base_distance_mm))
 
 
 PAPER_GRID = build(PAPER, 360.0)
@@ -45,7 +50,7 @@ def known(low: float, high: float, yaw_low: float, yaw_high: float, holes: int =
     i, j = np.nonzero(mask)
     middle = slice(len(i) // 2, len(i) // 2 + holes)
     mask[i[middle], j[middle]] = False
-    return ManipulationGrid(axis, axis, mask[None], ((0.0, 0.0, 0.0),), 45.0)
+    return ManipulationGrid(axis, axis, mask[None], (base_at(0.0, 0.0, 0.0),), 45.0)
 
 
 def test_paper_cell_has_the_papers_annulus() -> None:
@@ -63,7 +68,7 @@ def test_paper_annulus_is_decided_by_joint_limits() -> None:
         assert PAPER_ARM.within_limits(q)
         assert self_clearance_mm(PAPER_ARM, q) > 5
         assert ground_clearance_mm(PAPER_ARM, q) > 16  # above a block 15 mm high
-    wider = ArmModel(DESCRIPTION, {**PAPER, "elbow": [-168, -100], "wrist_pitch": [-95, 98]})
+    wider = ClosedFormArm(DESCRIPTION, {**PAPER, "elbow": [-168, -100], "wrist_pitch": [-95, 98]})
     assert feasible(wider, [[145.0, 0.0], [235.0, 0.0]], 45.0).all()
     assert not feasible(PAPER_ARM, [[145.0, 0.0], [235.0, 0.0]], 45.0).any()
 
@@ -90,24 +95,17 @@ def test_grid_is_of_world_multiples_and_mirrored() -> None:
     assert not edge.any()
 
 
-def test_base_frames_turn_with_their_facing() -> None:
-    for base in (*pair(360.0), (30.0, -20.0, 0.3)):
-        facing, left = (math.cos(base[2]), math.sin(base[2])), (-math.sin(base[2]), math.cos(base[2]))
-        world = [[base[axis] + 100 * facing[axis] + 40 * left[axis] for axis in range(2)]]
-        np.testing.assert_allclose(points_in_base(world, base), [[100.0, 40.0]], atol=1e-9)
-
-
 def test_mask_equals_feasibility_point_by_point() -> None:
     rng = np.random.default_rng(0)
     for arm_index, base in enumerate(PAPER_GRID.bases):
         for i, j in zip(rng.integers(0, len(PAPER_GRID.x_mm), 40), rng.integers(0, len(PAPER_GRID.y_mm), 40), strict=True):
-            point = points_in_base([PAPER_GRID.x_mm[i], PAPER_GRID.y_mm[j]], base)
+            point = base.to_local([PAPER_GRID.x_mm[i], PAPER_GRID.y_mm[j]])
             assert feasible(PAPER_ARM, point, 45.0) == PAPER_GRID.masks[arm_index, i, j]
 
 
 def test_one_arm_and_three_arms_work() -> None:
     cell = CellConfig()
-    bases = [(0.0, 0.0, 0.0), (400.0, 0.0, math.pi), (0.0, 400.0, 0.3)]
+    bases = [base_at(0.0, 0.0, 0.0), base_at(400.0, 0.0, math.pi), base_at(0.0, 400.0, 0.3)]
     assert manipulation_grid(PAPER_ARM, cell, bases[:1]).masks.shape[0] == 1
     three = manipulation_grid(PAPER_ARM, cell, bases)
     assert three.masks.any(axis=(1, 2)).all()
@@ -119,7 +117,7 @@ def test_collision_takes_points_away() -> None:
     """Near the table the wrist's own shape touches the ground, whatever the joint limits say."""
     q = PAPER_ARM.ik([190.0, 0.0, 10.0])[0]
     assert ground_clearance_mm(PAPER_ARM, q) < 0
-    wide = ArmModel(DESCRIPTION, {name: [-179, 179] for name in PAPER})
+    wide = ClosedFormArm(DESCRIPTION, {name: [-179, 179] for name in PAPER})
     assert wide.within_limits(wide.ik([190.0, 0.0, 10.0])).all()
     assert not feasible(wide, [190.0, 0.0], 10.0)
     folded = wide.ik([118.0, 0.0, 45.0])

@@ -220,7 +220,7 @@ def test_a_grip_just_outside_the_annulus_is_judged_too(paper_model, careful):
     """The cycle check lets a grip be a millimetre off."""
     cell, base = paper_model.cell, paper_model.cell.bases[0]
     way = np.array([math.cos(base.facing_rad + 0.3), math.sin(base.facing_rad + 0.3)])
-    edge = np.array([base.x_mm, base.y_mm]) + cell.r_max_mm * way
+    edge = base.position_mm + cell.r_max_mm * way
     paths = cycle(paper_model, 0, edge, PLACE_MM)
     for name, point in (("approach", -1), ("transfer", 0)):
         paths = changed(paths, name, point, 2, min(getattr(paths, name)[point, 2] + 0.002, paper_model.arm.upper_rad[2]))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from marl_handover.cell.collision import capsule_pairs, segment_distance, self_clearance_mm
-from marl_handover.cell.kinematics import transform
+from marl_handover.geometry.capsules import capsule_pairs, segment_distance, self_clearance_mm
+from marl_handover.geometry.se3 import transform
 from marl_handover.hardware.clearance import alone_mm, arm_shapes, between_mm
 
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marl_handover.cell.collision import ground_clearance_mm, self_clearance_mm
 from marl_handover.config import MotionConfig
+from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
 from marl_handover.hardware.calibration import nominal_calibration
 from marl_handover.hardware.clearance import arm_shapes, between_mm
 from marl_handover.hardware.gate import GateRejection, JointCommand, Reason, SafetyGate

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from marl_handover.cell.collision import capsule_pairs, ground_clearance_mm, segment_distance, self_clearance_mm
-from marl_handover.cell.kinematics import transform
-from marl_handover.cell.urdf import ARM_JOINTS
+from marl_handover.geometry.capsules import capsule_pairs, ground_clearance_mm, segment_distance, self_clearance_mm
+from marl_handover.geometry.se3 import transform
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.emulator.board import FRAME_S
 from marl_handover.hardware.gate import GateRejection, JointCommand, Reason
 from marl_handover.hardware.settings import ARMS

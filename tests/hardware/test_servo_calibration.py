@@ -10,8 +10,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, UnknownChoice
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import (
     CalibrationProblem,
     ServoMap,

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from marl_handover.cell import build_cell, cell_config
-from marl_handover.cell.collision import segment_distance as expected_distance
 from marl_handover.cell.symmetry import Symmetry
 from marl_handover.config import CentralisedConfig, MotionConfig
-from marl_handover.motion.batched import CROWDING, ROUNDING_MM, MotionCheck, segment_distance
+from marl_handover.geometry.capsules import segment_distance
+from marl_handover.motion.batched import CROWDING, ROUNDING_MM, MotionCheck
 from marl_handover.motion.batched_points import JOINTS, MotionNumbers, ends_of
 from marl_handover.motion.grasp import level_joints
 from marl_handover.motion.planner import MotionPlanner
@@ -132,14 +132,14 @@ def test_rows_do_not_depend_on_their_company(kit):
         assert torch.equal(alone, together[rows])
 
 
-def test_segment_distance_is_the_cells():
+def test_segment_distance_is_the_same_in_torch():
     random = np.random.default_rng(5)
     ends = random.normal(size=(4, 500, 3))
     ends[1, :50] = ends[0, :50]  # points
     ends[3, 25:75] = ends[2, 25:75]
     ends[3, 100:200] = ends[2, 100:200] + random.normal(size=(100, 1)) * (ends[1] - ends[0])[100:200]  # parallel
     found = segment_distance(*(torch.tensor(end) for end in ends)).numpy()
-    np.testing.assert_allclose(found, expected_distance(*ends), atol=1e-9)
+    np.testing.assert_allclose(found, segment_distance(*ends), atol=1e-9)
 
 
 def test_ends_are_the_executors_grasps(kit):

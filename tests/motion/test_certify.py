@@ -42,7 +42,7 @@ def test_a_path_through_the_other_arm_is_not_proved(model, planner):
 
 
 def test_no_point_moves_faster_than_the_levers_say(model, planner):
-    from tests.motion.test_kernels import in_base, placed, postures
+    from tests.geometry.test_kernels import in_base, placed, postures
 
     h = 1e-4
     for q in postures(model, 200, 11):

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from marl_handover.cell.build import build_cell, cell_config
-from marl_handover.cell.urdf import ARM_JOINTS
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.cycle import LIFTED_MM, timed_phases
 from marl_handover.motion.splines import basis
 from marl_handover.motion.trajectory import PHASES, CyclePaths, Phase

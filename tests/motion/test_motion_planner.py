@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from marl_handover.cell.build import build_cell, cell_config
-from marl_handover.cell.collision import ground_clearance_mm, self_clearance_mm
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting, NotFinite, UnknownChoice
+from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
 from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.motion.planner import MotionPlanner, string_length
 from marl_handover.motion.segment import NoPath

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from marl_handover.cell.collision import segment_distance
+from marl_handover.geometry.capsules import segment_distance
 from marl_handover.motion.objective import Price, columns, lagrangian, ramp
 from marl_handover.motion.segment import WEIGHTS
 from marl_handover.motion.splines import evaluate
 from marl_handover.motion.starts import fitted
-from tests.motion.test_kernels import placed
+from tests.geometry.test_kernels import placed
 
 OTHER = np.array([0.3, 1.0, -2.2, 1.2, 0.0])
 

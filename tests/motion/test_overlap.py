@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from marl_handover.cell.collision import capsule_pairs, segment_distance
+from marl_handover.geometry.capsules import capsule_pairs, segment_distance
 from marl_handover.motion.overlap import earliest_start_s, overlapped
 from tests.motion.test_motion_planner import place
 

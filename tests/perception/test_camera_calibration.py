@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
-from marl_handover.perception.calibration import CalibrationMismatch, CameraCalibration, Intrinsics, flat_pose, hung_camera, looking_down
+from marl_handover.geometry.se3 import flat_pose
+from marl_handover.perception.calibration import CalibrationMismatch, CameraCalibration, Intrinsics, hung_camera, looking_down
 from marl_handover.perception.settings import MountConfig
 
 numbers = st.floats(-1, 1)

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.perception.calibration import CalibrationMismatch, flat_pose
+from marl_handover.geometry.se3 import flat_pose
+from marl_handover.perception.calibration import CalibrationMismatch
 from marl_handover.perception.detector import Detector, fit_square
 from marl_handover.perception.scene import CellPainter
 from marl_handover.perception.settings import DetectorConfig, LookConfig, TargetConfig

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.boards import charuco_sheet
-from marl_handover.perception.calibration import CalibrationFailed, CameraCalibration, Intrinsics, flat_pose
+from marl_handover.perception.calibration import CalibrationFailed, CameraCalibration, Intrinsics
 from marl_handover.perception.intrinsics import calibrate_lens
 from marl_handover.perception.renderer import Renderer
 from marl_handover.perception.scene import held_boards, sheet_shape

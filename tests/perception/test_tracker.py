@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from marl_handover.perception.calibration import flat_pose
+from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.camera import Frame
 from marl_handover.perception.detector import Detector
 from marl_handover.perception.settings import TrackerConfig

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from marl_handover import policies
-from marl_handover.cell.collision import capsule_pairs, segment_distance
-from marl_handover.cell.urdf import ARM_JOINTS
+from marl_handover.geometry.capsules import capsule_pairs, segment_distance
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.body import block_capsules
 from marl_handover.runtime.interactive.cell import InteractiveCell, Snapshot
 

@@ -18,7 +18,7 @@ from interactive_storm import (
     storm,
 )
 
-from marl_handover.cell.collision import ground_clearance_mm, self_clearance_mm
+from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
 from marl_handover.motion.trajectory import NoPath
 from marl_handover.runtime.interactive.paths import FreePaths
 

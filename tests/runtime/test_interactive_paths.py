@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from marl_handover.cell.spaces import points_in_base
 from marl_handover.motion.trajectory import NoPath, OutOfArmsReach
 from marl_handover.runtime.interactive.paths import FreePaths
 from marl_handover.runtime.interactive.tracks import stopped
@@ -25,9 +24,7 @@ def paths(planner):
 
 def on_table(paths, arm, place):
     """World position (2,) of (radius_mm, yaw_deg) from an arm."""
-    base = paths.planner.model.cell.bases[arm]
-    angle = base.facing_rad + math.radians(place[1])
-    return np.array([base.x_mm + place[0] * math.cos(angle), base.y_mm + place[0] * math.sin(angle)])
+    return paths.planner.model.cell.bases[arm].around(place[0], math.radians(place[1]))
 
 
 def stop_of(paths, track, share):
@@ -45,8 +42,7 @@ def check(paths, arm, track, start, pin_mm=None):
     if pin_mm is None:
         assert paths.parked(track.end_rad)
     else:
-        base = model.cell.bases[arm]
-        assert np.allclose(grip[-1, :2], points_in_base(pin_mm, (base.x_mm, base.y_mm, base.facing_rad)), atol=0.02)
+        assert np.allclose(grip[-1, :2], model.cell.bases[arm].to_local(pin_mm), atol=0.02)
 
 
 @given(places, places, places, shares, st.integers(0, 1))

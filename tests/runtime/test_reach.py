@@ -36,10 +36,7 @@ def test_half_a_millimetre_off_the_rim_is_reachable_two_are_not(arm, yaw_deg, ri
     base = PAPER.bases[arm]
     angle = base.facing_rad + math.radians(yaw_deg)
     radius, sign = (PAPER.r_min_mm, -1) if rim == "inner" else (PAPER.r_max_mm, 1)
-    at = {
-        off: np.array([base.x_mm, base.y_mm]) + (radius + sign * off) * np.array([math.cos(angle), math.sin(angle)])
-        for off in (0.0, 0.5, 2.0)
-    }
+    at = {off: base.position_mm + (radius + sign * off) * np.array([math.cos(angle), math.sin(angle)]) for off in (0.0, 0.5, 2.0)}
     assert not PAPER.reaches(at[0.5]).any()
     np.testing.assert_allclose(drawn_in(PAPER, np.array([*at[0.5], 0.3]), EDGE_MM), [*at[0.0], 0.3], atol=1e-6)
     far = np.array([*at[2.0], 0.3])

@@ -8,8 +8,9 @@ import threading
 import numpy as np
 import pytest
 
+from marl_handover.geometry.se3 import flat_pose
 from marl_handover.hardware.clock import RealClock, VirtualClock
-from marl_handover.perception.calibration import flat_pose, hung_camera
+from marl_handover.perception.calibration import hung_camera
 from marl_handover.perception.camera import Frame, LiveCamera, RenderedCamera, StaleFrame
 from marl_handover.perception.detector import Detector
 from marl_handover.perception.scene import CellPainter

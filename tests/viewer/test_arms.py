@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marl_handover.cell.kinematics import transform
+from marl_handover.geometry.se3 import transform
 from marl_handover.viewer.arms import ArmNodes
 
 

@@ -14,8 +14,8 @@ import pytest
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.cli import main
 from marl_handover.config import TaskConfig
+from marl_handover.geometry.se3 import flat_pose
 from marl_handover.hardware.latch import StopLatch
-from marl_handover.perception.calibration import flat_pose
 from marl_handover.runtime.feed import EVENTS_FILE, STATE_FILE, Feed, Reading
 from marl_handover.runtime.steering import Ask
 from marl_handover.task.rules import Command, Rules

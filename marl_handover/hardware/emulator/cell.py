@@ -8,8 +8,8 @@ import random
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from marl_handover.cell.kinematics import ArmModel
-from marl_handover.cell.urdf import ARM_JOINTS
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.emulator.board import Board
 from marl_handover.hardware.emulator.device import Device

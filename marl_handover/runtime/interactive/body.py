@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
-from marl_handover.cell.kinematics import transform
+from marl_handover.geometry.se3 import transform
 from marl_handover.motion.cycle import LIFTED_MM
 from marl_handover.runtime.interactive.tracks import Track
 
@@ -106,9 +106,7 @@ class Body:
 
     def grip(self, arm: int) -> Floats:
         """T_world_grip (4, 4) in mm."""
-        base = self.model.cell.bases[arm]
-        T_world_base = transform((base.x_mm, base.y_mm, 0.0), (0.0, 0.0, base.facing_rad))
-        return np.asarray(T_world_base @ self.model.arm.fk(self.joints_rad[arm]))
+        return np.asarray(self.model.cell.bases[arm].matrix() @ self.model.arm.fk(self.joints_rad[arm]))
 
     def phase(self) -> str:
         """Name of what is under way, as in a planned cycle; "" for nothing."""

@@ -49,7 +49,7 @@ class FreePaths:
         middle = (model.cell.r_min_mm + model.cell.r_max_mm) / 2
         self._empty, self._loaded = [], []
         for arm, base in enumerate(model.cell.bases):
-            ahead = np.array([base.x_mm, base.y_mm]) + middle * np.array(base.facing)
+            ahead = base.to_world([middle, 0.0])
             self._empty.append(planner.reaching(arm, self.parked_rad, ahead, self.parked_rad, leaving=True)[0])
             self._loaded.append(planner.carrying(arm, ahead, ahead, self.parked_rad)[0])
 
@@ -174,7 +174,7 @@ class FreePaths:
 
     def _hand_mm(self, joints_rad: Floats) -> Floats:
         """Where the grip is over the table (2,), in the arm's base frame."""
-        return np.asarray(self.planner.model.arm.fk(joints_rad)[:2, 3])
+        return self.planner.model.arm.grip_mm(joints_rad)[:2]
 
     @staticmethod
     def _same(one: Floats, other: Floats) -> bool:

@@ -8,13 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from marl_handover.arrays import wrap
-from marl_handover.cell.kinematics import ArmModel, rotation, transform
-from marl_handover.cell.urdf import ARM_JOINTS, ArmDescription, read_urdf
 from marl_handover.errors import InvalidSetting, UnknownKey, UnsupportedKinematics
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.closed_form import ClosedFormArm, grip_in_plane, grip_speed, planar_ik
+from marl_handover.geometry.se3 import rotation, transform
+from marl_handover.geometry.urdf import ARM_JOINTS, ArmDescription, read_urdf
 from marl_handover.resources import resource_path
 
 SHIPPED = resource_path("urdf/al5a.urdf")
@@ -33,7 +36,7 @@ def moved(description: ArmDescription, **shifts_mm: tuple[float, float, float]) 
 
 # Upward offsets in every link, as a real bracket has them.
 BENT = moved(DESCRIPTION, shoulder=(-3, 0, 9), elbow=(2, 0, 11), wrist_pitch=(0, 0, -7), wrist_roll=(0, 0, 5), grasp=(4, 0, 0))
-ARMS = [ArmModel(DESCRIPTION, WIDE), ArmModel(BENT, WIDE)]
+ARMS = [ClosedFormArm(DESCRIPTION, WIDE), ClosedFormArm(BENT, WIDE)]
 angle = st.floats(-3.1, 3.1)
 
 
@@ -119,7 +122,7 @@ def test_stretched_arm_is_reachable() -> None:
 
 
 def test_limits_have_a_tiny_tolerance() -> None:
-    arm = ArmModel(DESCRIPTION, {"elbow": [-100, -10]})
+    arm = ClosedFormArm(DESCRIPTION, {"elbow": [-100, -10]})
     inside = np.radians([0.0, 10.0, -10.0, 0.0, 0.0])
     assert arm.within_limits(inside)
     assert arm.within_limits(inside + [0, 0, 5e-10, 0, 0])
@@ -132,19 +135,19 @@ def test_limits_have_a_tiny_tolerance() -> None:
 def test_solutions_beyond_half_a_turn_are_found_within_limits() -> None:
     q = np.radians([0.0, 150.0, -150.0, 0.0, 0.0])
     point = ARMS[0].fk(q)[:3, 3]
-    arm = ArmModel(DESCRIPTION, {**WIDE, "shoulder": [-220.0, -200.0]})
+    arm = ClosedFormArm(DESCRIPTION, {**WIDE, "shoulder": [-220.0, -200.0]})
     assert math.degrees(arm.ik(point)[0, 1]) == pytest.approx(-210.0)
 
 
 @pytest.mark.parametrize("limits", [[10, -10], [1.0], [0, math.inf], [math.nan, 1]])
 def test_bad_limits_are_named(limits: list[float]) -> None:
     with pytest.raises(InvalidSetting, match=r"joint_limits_deg\.elbow"):
-        ArmModel(DESCRIPTION, {"elbow": limits})
+        ClosedFormArm(DESCRIPTION, {"elbow": limits})
 
 
 def test_unknown_joint_is_named() -> None:
     with pytest.raises(UnknownKey, match="knee.*elbow"):
-        ArmModel(DESCRIPTION, {"knee": [0, 1]})
+        ClosedFormArm(DESCRIPTION, {"knee": [0, 1]})
 
 
 @pytest.mark.parametrize(
@@ -166,7 +169,7 @@ def test_another_kinematic_class_is_refused(tmp_path: Path, old: str, new: str, 
     path = tmp_path / "other.urdf"
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(UnsupportedKinematics) as caught:
-        ArmModel(read_urdf(path))
+        ClosedFormArm(read_urdf(path))
     assert message in str(caught.value)
 
 
@@ -177,3 +180,39 @@ def test_rotation_follows_urdf_rpy() -> None:
     pitch = [[math.cos(p), 0, math.sin(p)], [0, 1, 0], [-math.sin(p), 0, math.cos(p)]]
     yaw = [[math.cos(y), -math.sin(y), 0], [math.sin(y), math.cos(y), 0], [0, 0, 1]]
     np.testing.assert_allclose(transform((1, 2, 3), (r, p, y))[:3, :3], np.array(yaw) @ pitch @ roll, atol=1e-12)
+
+
+@pytest.mark.parametrize("arm", ARMS, ids=["shipped", "bent"])
+@settings(max_examples=60, deadline=None)
+@given(yaw=angle, shoulder=angle, elbow=angle, pitch=angle, roll=angle)
+def test_the_jacobian_is_what_finite_differences_give(
+    arm: ClosedFormArm, yaw: float, shoulder: float, elbow: float, pitch: float, roll: float
+) -> None:
+    q, h = np.array([yaw, shoulder, elbow, pitch, roll]), 1e-6
+    J, T = arm.jacobian(q), arm.fk(q)
+    for joint in range(5):
+        step = h * np.eye(5)[joint]
+        before, after = arm.fk(q - step), arm.fk(q + step)
+        np.testing.assert_allclose(J[:3, joint], (after - before)[:3, 3] / (2 * h), atol=1e-4)
+        turn = (after - before)[:3, :3] / (2 * h) @ T[:3, :3].T  # the skew matrix of the angular velocity
+        np.testing.assert_allclose(J[3:, joint], [turn[2, 1], turn[0, 2], turn[1, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("arm", ARMS, ids=["shipped", "bent"])
+@settings(max_examples=60, deadline=None)
+@given(yaw=angle, shoulder=angle, elbow=angle, pitch=angle, roll=angle)
+def test_the_plane_agrees_with_space_in_numpy_and_in_torch(
+    arm: ClosedFormArm, yaw: float, shoulder: float, elbow: float, pitch: float, roll: float
+) -> None:
+    q, rates = np.array([yaw, shoulder, elbow, pitch, roll]), np.array([0.3, -0.7, 0.2, 1.1, 0.9])
+    np.testing.assert_allclose(arm.grip_mm(q), arm.fk(q)[:3, 3], atol=1e-9)
+    speed = np.linalg.norm(arm.jacobian(q)[:3] @ rates)
+    assert float(grip_speed(arm.planar, q, rates)) == pytest.approx(speed, abs=1e-9)
+    r, z = grip_in_plane(arm.planar, torch.tensor(q))
+    np.testing.assert_allclose([float(r), float(z)], grip_in_plane(arm.planar, q), atol=1e-9)
+    for elbow_sign in (-1, 1):
+        found = planar_ik(
+            arm.planar, *(torch.tensor(value, dtype=torch.float64) for value in (float(r), float(z), shoulder + elbow + pitch)), elbow_sign
+        )
+        expected = planar_ik(arm.planar, float(r), float(z), shoulder + elbow + pitch, elbow_sign)
+        np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)

@@ -8,12 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from marl_handover.cell.collision import enclosing_capsule, ground_clearance_mm, segment_distance, self_clearance_mm
-from marl_handover.cell.kinematics import ArmModel, transform
-from marl_handover.cell.urdf import Primitive, read_urdf
+from marl_handover.geometry.capsules import enclosing_capsule, ground_clearance_mm, segment_distance, self_clearance_mm
+from marl_handover.geometry.closed_form import ClosedFormArm
+from marl_handover.geometry.se3 import transform
+from marl_handover.geometry.urdf import Primitive, read_urdf
 from marl_handover.resources import resource_path
 
-ARM = ArmModel(read_urdf(resource_path("urdf/al5a.urdf")))
+ARM = ClosedFormArm(read_urdf(resource_path("urdf/al5a.urdf")))
 LINKS = {link.name: link for link in ARM.description.links}
 BODIES = [["base_link"], ["turret"], ["upper_arm"], ["forearm"], ["wrist"], ["hand", "finger_left_link", "finger_right_link"]]
 Floats = NDArray[np.float64]
@@ -97,7 +98,7 @@ def test_capsule_encloses_its_shape_closely(shape: Primitive) -> None:
 def test_ground_clearance_of_a_shape_equals_its_lowest_sampled_point(shape: Primitive, monkeypatch: pytest.MonkeyPatch) -> None:
     links = tuple(link if link.name != "hand" else type(link)("hand", (shape,)) for link in ARM.description.links)
     bare = tuple(link if link.name in ("hand", "turret") else type(link)(link.name, ()) for link in links)
-    arm = ArmModel(type(ARM.description)(**{**vars(ARM.description), "links": bare}))
+    arm = ClosedFormArm(type(ARM.description)(**{**vars(ARM.description), "links": bare}))
     q = np.random.default_rng(3).uniform(arm.lower_rad, arm.upper_rad, (20, 5))
     frames = arm.link_transforms(q)["hand"]
     heights = surface(shape) @ frames[:, 2, :3].T + frames[:, 2, 3]

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marl_handover.cell.collision import segment_distance
+from marl_handover.geometry.capsules import segment_distance
+from marl_handover.geometry.kernels import at_wrist, beyond, elbow_up, nearest, pivots, place_capsules, push, turned
 from marl_handover.motion.body import ArmBody, block_capsules, out_of_reach
-from marl_handover.motion.kernels import at_wrist, beyond, elbow_up, nearest, pivots, place_capsules, push, turned
 
 
 def postures(model, count, seed):

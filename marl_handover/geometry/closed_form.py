@@ -1,7 +1,9 @@
-"""Forward and closed-form inverse kinematics of an arm of the class yaw + planar 3R + roll.
+"""Arms of the class yaw + planar 3R + roll: their kinematics in closed form.
 
 A joint vector is q = (base_yaw, shoulder, elbow, wrist_pitch, wrist_roll) in rad. Frames: ``base`` lies on the table under the yaw axis,
-``grip`` is the grasp frame. ``T_a_b`` takes coordinates in b to coordinates in a; translations are in mm.
+``grip`` is the grasp frame. Below the class: the same kinematics in the arm's own vertical plane for numpy and torch, whole batches at
+once. There a point is (r, z): forward of the yaw axis and up from the table; ``planar`` (8,) holds the shoulder's (r, z), then the
+vectors shoulder-elbow, elbow-wrist and wrist-grip at zero. For compiled loops: :mod:`marl_handover.geometry.kernels`.
 """
 
 from __future__ import annotations
@@ -10,17 +12,13 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from marl_handover.arrays import wrap
-from marl_handover.cell.urdf import ARM_JOINTS, ArmDescription, Joint, Vector
+from marl_handover.arrays import Array, namespace, wrap
 from marl_handover.errors import InvalidSetting, UnknownKey, UnsupportedKinematics
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-
-LIMIT_TOLERANCE_RAD = 1e-9
-"""Joint values may pass a limit by this much: inverse kinematics at a limit are exact only up to rounding."""
+from marl_handover.geometry.arm_model import LIMIT_TOLERANCE_RAD, Bools, Floats
+from marl_handover.geometry.se3 import rotation, transform
+from marl_handover.geometry.urdf import ARM_JOINTS, ArmDescription, Joint, Vector
 
 _GEOMETRY_TOLERANCE = 1e-6  # mm or a unit vector's components: well below any machining, well above float rounding
 _AXES: dict[str, Vector] = {
@@ -32,29 +30,13 @@ _AXES: dict[str, Vector] = {
 }
 
 
-def transform(xyz_mm: Sequence[float], rpy_rad: Sequence[float]) -> Floats:
-    """The (4, 4) transform of a URDF ``<origin>``: roll, pitch and yaw about the fixed x, y and z axes, then the shift."""
-    T: Floats = np.eye(4)
-    x, y, z = (rotation(np.asarray(angle), axis) for angle, axis in zip(rpy_rad, np.eye(3), strict=True))
-    T[:3, :3] = z @ y @ x
-    T[:3, 3] = xyz_mm
-    return T
-
-
-def rotation(angle_rad: Floats, axis: Sequence[float] | Floats) -> Floats:
-    """Rotations (..., 3, 3) by ``angle_rad`` (...) about the unit vector ``axis`` (3,)."""
-    x, y, z = axis
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    angle = np.asarray(angle_rad, dtype=float)[..., None, None]
-    return np.asarray(np.eye(3) + np.sin(angle) * skew + (1.0 - np.cos(angle)) * (skew @ skew))
-
-
-class ArmModel:
-    """Kinematics of one arm; its geometry is read off the URDF.
+class ClosedFormArm:
+    """An :class:`~marl_handover.geometry.arm_model.ArmModel` whose geometry is read off the URDF.
 
     Public attributes, arrays read-only: ``description``; ``lower_rad`` and ``upper_rad`` (5,); ``shoulder_mm`` (2,), the shoulder axis in
     the arm's vertical plane (forward of the yaw axis, up from the table); ``upper_arm_mm``, ``forearm_mm`` and ``tool_mm`` (2,), the
-    vectors shoulder-elbow, elbow-wrist and wrist-grip at zero; ``reach_mm``, a bound on the grip's distance from the yaw axis.
+    vectors shoulder-elbow, elbow-wrist and wrist-grip at zero; ``planar`` (8,), all four after each other; ``reach_mm``, a bound on the
+    grip's distance from the yaw axis.
     """
 
     def __init__(self, description: ArmDescription, limits_deg: Mapping[str, Sequence[float]] | None = None) -> None:
@@ -71,6 +53,7 @@ class ArmModel:
         self.upper_arm_mm, self.forearm_mm = _frozen(origins[2] - origins[1]), _frozen(origins[3] - origins[2])
         self.tool_mm = _frozen(grip_mm - origins[3])
         vectors = (self.upper_arm_mm, self.forearm_mm, self.tool_mm)
+        self.planar = _frozen(np.concatenate([self.shoulder_mm, *vectors]))
         self.reach_mm = abs(float(self.shoulder_mm[0])) + sum(math.hypot(*vector) for vector in vectors)
         self._origins = {joint.name: transform(joint.xyz_mm, joint.rpy_rad) for joint in description.joints}
 
@@ -81,6 +64,25 @@ class ArmModel:
         for joint in self.description.chain():
             T = self._after(joint, T, q, None)
         return np.broadcast_to(T, (*q.shape[:-1], 4, 4)).copy()
+
+    def grip_mm(self, q: ArrayLike) -> Floats:
+        """Grip positions (..., 3) in mm of joint vectors ``q`` (..., >= 4) in rad: those of :meth:`fk`, without its matrices."""
+        q = np.asarray(q, dtype=float)
+        r, z = grip_in_plane(self.planar, q)
+        return np.stack([r * np.cos(q[..., 0]), r * np.sin(q[..., 0]), z], axis=-1)
+
+    def jacobian(self, q: ArrayLike) -> Floats:
+        """Geometric Jacobians (..., 6, 5) of the grip in the base frame: mm/rad, then rad/rad, for joint vectors ``q`` (..., 5) in rad."""
+        q = np.asarray(q, dtype=float)
+        T, axes, origins = np.eye(4), [], []
+        for joint in self.description.chain():
+            T = self._after(joint, T, q, None)
+            if joint.kind != "fixed":
+                shape = (*q.shape[:-1], 3)
+                axes.append(np.broadcast_to(T[..., :3, :3] @ np.asarray(joint.axis), shape))
+                origins.append(np.broadcast_to(T[..., :3, 3], shape))
+        columns = [np.concatenate([np.cross(axis, T[..., :3, 3] - at), axis], axis=-1) for axis, at in zip(axes, origins, strict=True)]
+        return np.stack(columns, axis=-1)
 
     def link_transforms(self, q: ArrayLike, gripper_mm: float | None = None) -> dict[str, Floats]:
         """Link name -> T_base_link (..., 4, 4) in mm, for joint vectors ``q`` (..., 5) in rad.
@@ -103,10 +105,11 @@ class ArmModel:
         shape = np.broadcast_shapes(position.shape[:-1], np.shape(pitch_rad), np.shape(roll_rad))
         pitch, roll = np.broadcast_to(np.asarray(pitch_rad, dtype=float), shape), np.broadcast_to(np.asarray(roll_rad, dtype=float), shape)
         x, y, z = (np.broadcast_to(position[..., axis], shape) for axis in range(3))
-        tool_x, tool_z = self.tool_mm
-        forward = np.hypot(x, y) - (np.cos(pitch) * tool_x - np.sin(pitch) * tool_z) - self.shoulder_mm[0]
-        up = z - (np.sin(pitch) * tool_x + np.cos(pitch) * tool_z) - self.shoulder_mm[1]
-        return np.stack([self._branch(sign, np.arctan2(y, x), forward, up, pitch, roll) for sign in (-1.0, 1.0)], axis=-2)
+        branches = []
+        for elbow in (-1, 1):
+            pitches = planar_ik(self.planar, np.hypot(x, y), z, pitch, elbow)
+            branches.append(self._nearest_turn(np.concatenate([np.arctan2(y, x)[..., None], pitches, roll[..., None]], axis=-1)))
+        return np.stack(branches, axis=-2)
 
     def within_limits(self, q: ArrayLike) -> Bools:
         """Whether joint vectors ``q`` (..., 5) are within the joint limits, up to :data:`LIMIT_TOLERANCE_RAD`; shape (...). NaN is not."""
@@ -114,17 +117,9 @@ class ArmModel:
         inside = (q >= self.lower_rad - LIMIT_TOLERANCE_RAD) & (q <= self.upper_rad + LIMIT_TOLERANCE_RAD)
         return np.asarray(inside.all(axis=-1))
 
-    def _branch(self, sign: float, yaw: Floats, forward: Floats, up: Floats, pitch: Floats, roll: Floats) -> Floats:
-        """One elbow branch (..., 5) of the planar arm whose wrist is (forward, up) mm from the shoulder."""
-        length_1, length_2 = math.hypot(*self.upper_arm_mm), math.hypot(*self.forearm_mm)
-        slope_1, slope_2 = (math.atan2(vector[1], vector[0]) for vector in (self.upper_arm_mm, self.forearm_mm))
-        cosine = (forward**2 + up**2 - length_1**2 - length_2**2) / (2 * length_1 * length_2)
-        # A stretched arm's cosine may come out at 1 + rounding; it is reachable.
-        cosine = np.where(np.abs(cosine) > 1 + 1e-12, np.nan, np.clip(cosine, -1.0, 1.0))
-        bend = sign * np.arccos(cosine)
-        shoulder = np.arctan2(up, forward) - np.arctan2(length_2 * np.sin(bend), length_1 + length_2 * np.cos(bend)) - slope_1
-        elbow = bend + slope_1 - slope_2
-        q = wrap(np.stack([yaw, shoulder, elbow, pitch - shoulder - elbow, roll], axis=-1))
+    def _nearest_turn(self, q: Floats) -> Floats:
+        """Joint vectors with each joint turned by whole turns to where it is within its limits, if it can be; NaN where one of them is."""
+        q = wrap(q)
         for turn in (2 * math.pi, -2 * math.pi):  # limits may reach past half a turn
             outside = (q < self.lower_rad - LIMIT_TOLERANCE_RAD) | (q > self.upper_rad + LIMIT_TOLERANCE_RAD)
             fits = (q + turn >= self.lower_rad - LIMIT_TOLERANCE_RAD) & (q + turn <= self.upper_rad + LIMIT_TOLERANCE_RAD)
@@ -145,6 +140,61 @@ class ArmModel:
         out = np.broadcast_to(T, np.broadcast_shapes(T.shape, (*R_joint.shape[:-2], 4, 4))).copy()
         out[..., :3, :3] = T[..., :3, :3] @ R_joint
         return out
+
+
+def pitch_frames(planar: Array, q: Array) -> tuple[Array, Array, Array, Array]:
+    """Where shoulder, elbow and wrist are, and how what each carries is pitched, of joints ``q`` (..., >= 4).
+
+    Returns:
+        r and z in mm, and the cosine and sine of the pitch, each (..., 3).
+    """
+    xp = namespace(q)
+    angle = xp.cumsum(q[..., 1:4], -1)
+    cos, sin = xp.cos(angle), xp.sin(angle)
+    vectors = [float(value) for value in planar[:6]]
+    zero = 0 * cos[..., 0]
+    r, z = [zero + vectors[0]], [zero + vectors[1]]
+    for link in range(2):
+        x, y = vectors[2 + 2 * link], vectors[3 + 2 * link]
+        r.append(r[-1] + cos[..., link] * x - sin[..., link] * y)
+        z.append(z[-1] + sin[..., link] * x + cos[..., link] * y)
+    return xp.stack(r, -1), xp.stack(z, -1), cos, sin
+
+
+def grip_in_plane(planar: Array, q: Array) -> tuple[Array, Array]:
+    """The grip's (r, z) in mm, each (...), of joints ``q`` (..., >= 4)."""
+    r, z, cos, sin = (part[..., 2] for part in pitch_frames(planar, q))
+    x, y = float(planar[6]), float(planar[7])
+    return r + cos * x - sin * y, z + sin * x + cos * y
+
+
+def grip_speed(planar: Array, q: Array, rates: Array) -> Array:
+    """Speed (...) of the grip in mm per unit, of joints ``q`` (..., >= 4) that change by ``rates`` (..., >= 4) a unit."""
+    xp = namespace(q)
+    r, z, _, _ = pitch_frames(planar, q)
+    grip_r, grip_z = grip_in_plane(planar, q)
+    outward = ((z - grip_z[..., None]) * rates[..., 1:4]).sum(-1)
+    upward = ((grip_r[..., None] - r) * rates[..., 1:4]).sum(-1)
+    return xp.sqrt((grip_r * rates[..., 0]) ** 2 + outward**2 + upward**2)
+
+
+def planar_ik(planar: Array, r: Array, z: Array, pitch: Array, elbow: int) -> Array:
+    """Shoulder, elbow and wrist pitch (..., 3) with the grip at (r, z) mm and this pitch, each (...); NaN out of reach, not wrapped.
+
+    ``elbow``: -1 bends the forearm down (elbow up), 1 bends it up.
+    """
+    xp = namespace(r)
+    r_0, z_0, upper_r, upper_z, fore_r, fore_z, tool_r, tool_z = (float(value) for value in planar[:8])
+    upper, fore = math.hypot(upper_r, upper_z), math.hypot(fore_r, fore_z)
+    slope_1, slope_2 = math.atan2(upper_z, upper_r), math.atan2(fore_z, fore_r)
+    forward = r - (xp.cos(pitch) * tool_r - xp.sin(pitch) * tool_z) - r_0
+    up = z - (xp.sin(pitch) * tool_r + xp.cos(pitch) * tool_z) - z_0
+    cosine = (forward**2 + up**2 - upper**2 - fore**2) / (2 * upper * fore)
+    # A stretched arm's cosine may come out at 1 + rounding; it is reachable.
+    bend = elbow * xp.arccos(xp.where(abs(cosine) > 1 + 1e-12, math.nan, xp.clip(cosine, -1.0, 1.0)))
+    shoulder = xp.atan2(up, forward) - xp.atan2(fore * xp.sin(bend), upper + fore * xp.cos(bend)) - slope_1
+    bent = bend + slope_1 - slope_2
+    return xp.stack([shoulder, bent, pitch - shoulder - bent], -1)
 
 
 def _frozen(values: Floats) -> Floats:

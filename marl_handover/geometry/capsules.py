@@ -12,8 +12,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from marl_handover.cell.kinematics import ArmModel, Floats, transform
-from marl_handover.cell.urdf import ARM_JOINTS, ArmDescription, Primitive
+from marl_handover.arrays import Array, namespace
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.closed_form import Floats
+from marl_handover.geometry.se3 import apply, transform
+from marl_handover.geometry.urdf import ARM_JOINTS, ArmDescription, Primitive
 
 
 @dataclass(frozen=True)
@@ -51,8 +54,8 @@ def self_clearance_mm(arm: ArmModel, q: ArrayLike) -> Floats:
     if not len(first):
         return np.full(np.shape(q)[:-1], np.inf)
     frames = arm.link_transforms(q)
-    starts = np.stack([_points(frames[capsule.link], capsule.start_mm) for capsule in capsules])
-    ends = np.stack([_points(frames[capsule.link], capsule.end_mm) for capsule in capsules])
+    starts = np.stack([apply(frames[capsule.link], capsule.start_mm) for capsule in capsules])
+    ends = np.stack([apply(frames[capsule.link], capsule.end_mm) for capsule in capsules])
     radii = np.array([capsule.radius_mm for capsule in capsules])
     best = np.full(np.shape(q)[:-1], np.inf)
     for i, j in zip(first, second, strict=True):  # a loop over some thirty pairs keeps the arrays small enough for the cache
@@ -61,19 +64,20 @@ def self_clearance_mm(arm: ArmModel, q: ArrayLike) -> Floats:
     return best
 
 
-def segment_distance(start_1: Floats, end_1: Floats, start_2: Floats, end_2: Floats) -> Floats:
-    """Distance (...) between the segments start-end (..., 3); exact also for parallel segments and for points."""
+def segment_distance(start_1: Array, end_1: Array, start_2: Array, end_2: Array) -> Array:
+    """Distance (...) between the segments start-end (..., 3), numpy or torch; exact also for parallel segments and for points."""
+    xp = namespace(start_1)
     d1, d2, gap = end_1 - start_1, end_2 - start_2, start_1 - start_2
     a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
     c, f = _dot(d1, gap), _dot(d2, gap)
     # Nearest points of the two lines, clamped to the first segment, then to the second, then the first once more for that point.
     determinant = a * e - b * b
     skew = determinant > 1e-12 * a * e
-    s = np.where(skew, np.clip((b * f - c * e) / np.where(skew, determinant, 1.0), 0.0, 1.0), 0.0)
-    t = np.where(e > 0, np.clip((b * s + f) / np.where(e > 0, e, 1.0), 0.0, 1.0), 0.0)
-    s = np.where(a > 0, np.clip((b * t - c) / np.where(a > 0, a, 1.0), 0.0, 1.0), 0.0)
+    s = xp.where(skew, xp.clip((b * f - c * e) / xp.where(skew, determinant, 1.0), 0.0, 1.0), 0.0)
+    t = xp.where(e > 0, xp.clip((b * s + f) / xp.where(e > 0, e, 1.0), 0.0, 1.0), 0.0)
+    s = xp.where(a > 0, xp.clip((b * t - c) / xp.where(a > 0, a, 1.0), 0.0, 1.0), 0.0)
     between = gap + s[..., None] * d1 - t[..., None] * d2
-    return np.asarray(np.sqrt(_dot(between, between)))
+    return xp.sqrt(_dot(between, between))
 
 
 def enclosing_capsule(link: str, shape: Primitive) -> Capsule:
@@ -99,12 +103,8 @@ def enclosing_capsule(link: str, shape: Primitive) -> Capsule:
     return Capsule(link, ends[0], ends[1], radius)  # type: ignore[arg-type]
 
 
-def _dot(a: Floats, b: Floats) -> Floats:
+def _dot(a: Array, b: Array) -> Array:
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
-
-
-def _points(T: Floats, point_mm: tuple[float, float, float]) -> Floats:
-    return np.asarray(T[..., :3, :3] @ np.asarray(point_mm) + T[..., :3, 3])
 
 
 def _lowest_mm(T_base_link: Floats, shape: Primitive) -> Floats:

@@ -53,7 +53,7 @@ def at_wrist(frames: Floats, i: int, x: float, z: float) -> tuple[float, float]:
 def elbow_up(planar: Floats, r: Floats, z: Floats, pitch: Floats, out: Floats) -> None:
     """Fill ``out`` (n, 3) with shoulder, elbow and wrist pitch of the elbow-up arm whose grip is at (r, z) mm; NaN out of reach.
 
-    The compiled twin of :meth:`marl_handover.cell.kinematics.ArmModel.ik` for first guesses; joint values are not wrapped.
+    The compiled twin of :meth:`marl_handover.geometry.closed_form.ArmModel.ik` for first guesses; joint values are not wrapped.
     """
     upper, forearm = math.hypot(planar[2], planar[3]), math.hypot(planar[4], planar[5])
     slope_1, slope_2 = math.atan2(planar[3], planar[2]), math.atan2(planar[5], planar[4])
