@@ -6,6 +6,7 @@ with ``exit_status``.
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,22 @@ class CorruptFile(HandoverError):
     def __init__(self, what: str, path: Path | str, reason: str) -> None:
         super().__init__(f"{what} {path} cannot be read: {reason}")
         self.what, self.path, self.reason = what, Path(path), reason
+
+
+class CannotWrite(HandoverError, OSError):
+    """A file cannot be written. ``exit_status`` is 1 if its path is fine but there is no room, 2 if nothing can be written there."""
+
+    def __init__(self, path: Path | str, error: OSError) -> None:
+        super().__init__(error.errno, error.strerror or str(error))
+        self.path, self.exit_status = Path(path), exit_status_of(error)
+
+    def __str__(self) -> str:
+        return f"{self.path} cannot be written: {self.strerror}"
+
+
+def exit_status_of(error: OSError) -> int:
+    """1 for a device that is full or fails, 2 for a path that cannot be."""
+    return 1 if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO) else 2
 
 
 class UrdfError(HandoverError):
@@ -138,3 +155,8 @@ class MissingExtra(HandoverError):
     def __init__(self, setting: str, package: str, extra: str) -> None:
         super().__init__(f"{setting} needs the package {package}; run: pip install 'marl_handover[{extra}]'")
         self.setting, self.package, self.extra = setting, package, extra
+
+
+def first_line(error: BaseException) -> str:
+    """First line of what an error says, or its kind if it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

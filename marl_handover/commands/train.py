@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from marl_handover.errors import CheckpointMismatch, InvalidSetting, MissingFile
 from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.settings import TrainConfig
+from marl_handover.locks import claimed, new_folder
 
 if TYPE_CHECKING:
     from marl_handover.learning.trainer import Trainer
@@ -23,22 +24,24 @@ FREE_ON_RESUME = ("resume", "out", "progress")
 
 
 def run(config: TrainConfig) -> int:
-    """Start a run, or continue one from its last checkpoint with the settings it was started with."""
-    from marl_handover.learning.checkpoint import FILE
-    from marl_handover.learning.trainer import Trainer
+    """Start a run, or continue one from its last checkpoint with the settings it was started with.
 
+    Raises:
+        FolderBusy: another process trains in that folder.
+    """
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     if config.resume:
-        trainer = resumed(Path(config.resume), config)
+        folder = Path(config.resume)
+        if not folder.is_dir():
+            raise MissingFile("run directory", folder)
+        with claimed(folder):
+            trainer = resumed(folder, config)
+            summary = trainer.run()
     else:
-        folder = Path(config.out or datetime.now().strftime("runs/%Y%m%d-%H%M%S"))
-        if folder.exists() and not folder.is_dir():
-            raise InvalidSetting("out", str(folder), "a folder; this is a file")
-        if (folder / FILE).exists():
-            raise InvalidSetting("out", str(folder), f"a folder without a run; continue that one with resume={folder}")
-        config.out = str(folder)
-        trainer = Trainer(config, folder)
-    summary = trainer.run()
+        trainer = _begun(config)
+        with claimed(trainer.folder):
+            _require_no_run(trainer.folder)  # somebody else may have made one meanwhile
+            summary = trainer.run()
     validation = summary["validation"]
     print(
         f"{trainer.folder}: {summary['step']} environment steps, {summary['gradient_step']} gradient steps, "
@@ -46,6 +49,31 @@ def run(config: TrainConfig) -> int:
         file=sys.stderr,
     )
     return 0
+
+
+def _begun(config: TrainConfig) -> Trainer:
+    """A trainer of a new run, in ``out`` or in a folder of its own; bad settings make none."""
+    from marl_handover.learning.trainer import Trainer
+
+    if config.out:
+        _require_no_run(Path(config.out))
+        return Trainer(config, Path(config.out))
+    folder = new_folder(Path(datetime.now().strftime("runs/%Y%m%d-%H%M%S")))
+    config.out = str(folder)
+    try:
+        return Trainer(config, folder)
+    except BaseException:
+        folder.rmdir()
+        raise
+
+
+def _require_no_run(folder: Path) -> None:
+    from marl_handover.learning.checkpoint import FILE
+
+    if folder.exists() and not folder.is_dir():
+        raise InvalidSetting("out", str(folder), "a folder; this is a file")
+    if (folder / FILE).exists():
+        raise InvalidSetting("out", str(folder), f"a folder without a run; continue that one with resume={folder}")
 
 
 def resumed(folder: Path, asked: TrainConfig | None = None) -> Trainer:
@@ -58,8 +86,6 @@ def resumed(folder: Path, asked: TrainConfig | None = None) -> Trainer:
     from marl_handover.learning.export import train_config
     from marl_handover.learning.trainer import Trainer
 
-    if not folder.is_dir():
-        raise MissingFile("run directory", folder)
     unsaved = not (folder / FILE).exists() and (folder / "config.yaml").exists()
     source = folder / ("config.yaml" if unsaved else FILE)
     text = source.read_text(encoding="utf-8", errors="replace") if unsaved else load_checkpoint(folder)["config"]

@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from marl_handover.compare import records, suite_check
-from marl_handover.compare.locks import held
 from marl_handover.compare.records import fingerprint, read_record, settings_of, write_record
 from marl_handover.errors import HandoverError, WorkFailed
 from marl_handover.learning.settings import TrainConfig
+from marl_handover.locks import held
 from marl_handover.runtime.assessment import AssessmentConfig
 from marl_handover.runtime.settings import twin_lab
 

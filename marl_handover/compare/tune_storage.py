@@ -20,8 +20,8 @@ from optuna.study import Study
 from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
-from marl_handover.compare.locks import held
 from marl_handover.errors import HandoverError
+from marl_handover.locks import held
 
 BEAT_S = 60.0
 """A trial that runs says so this often ..."""

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from marl_handover.cell import load_cell
-from marl_handover.errors import CorruptFile
-from marl_handover.files import temporary_of
+from marl_handover.errors import CorruptFile, HandoverError, first_line
+from marl_handover.files import writing
 from marl_handover.learning.algorithm import Algorithm
 from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.checkpoint import FILE, load_checkpoint
@@ -54,10 +54,8 @@ def policy_arrays(algorithm: Algorithm, config: TrainConfig, origin: str) -> Arr
 
 def save_policy(path: Path, arrays: Arrays) -> None:
     """Write a policy file as a whole."""
-    temporary = temporary_of(path)
-    with temporary.open("wb") as stream:
+    with writing(path) as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]
-    temporary.replace(path)
 
 
 def run_arrays(folder: Path) -> Arrays:
@@ -78,8 +76,10 @@ def run_arrays(folder: Path) -> Arrays:
         if state["best"]:
             algorithm.actor().load_state_dict(state["best"]["actor"])
             step = state["best"]["step"]
-    except (KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise CorruptFile("checkpoint", folder / FILE, f"its parts do not fit together ({str(error).splitlines()[0]})") from error
+    except HandoverError:
+        raise
+    except Exception as error:  # torch and what is made of the parts raise many kinds
+        raise CorruptFile("checkpoint", folder / FILE, f"its parts do not fit together ({first_line(error)[:100]})") from error
     return policy_arrays(algorithm, config, f"{folder} at step {step}")
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import math
+import os
+import socket
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from marl_handover.errors import Diverged
-from marl_handover.files import write_whole
+from marl_handover.files import GrowingFile, write_whole
 
 COLUMNS = (
     "step",
@@ -47,11 +50,10 @@ class Recorder:
     """
 
     def __init__(self, folder: Path, total_steps: int, start_step: int = 0, progress: bool = True) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
         self.path = folder / "metrics.csv"
         self._keep_until(start_step)
-        self.board = SummaryWriter(str(folder), purge_step=start_step + 1 if start_step else None)
+        self.table = GrowingFile(self.path)
+        self.board = Board(folder, start_step)
         self.bar = tqdm(total=total_steps, initial=start_step, unit="step", disable=not progress, dynamic_ncols=True)
 
     def _keep_until(self, step: int) -> None:
@@ -72,16 +74,46 @@ class Recorder:
     def record(self, row: dict[str, float]) -> None:
         """Append one row; values that a run does not have stay empty."""
         values = [_text(row.get(name)) for name in COLUMNS]
-        with self.path.open("a", encoding="utf-8") as stream:
-            stream.write(",".join(values) + "\n")
-        for name, value in row.items():
-            if name != "step" and math.isfinite(value):
-                self.board.add_scalar(name, value, int(row["step"]))
+        self.table.write(",".join(values) + "\n")
+        self.board.record(row)
 
     def close(self) -> None:
-        """Flush the events and end the bar."""
+        """Close the files and end the bar."""
+        self.table.close()
         self.board.close()
         self.bar.close()
+
+
+class Board:
+    """The same rows as TensorBoard events, written out at once. TensorBoard's own writer has a thread, which cannot tell of a full disk.
+
+    Args:
+        folder: the run directory.
+        start_step: step the run continues from; TensorBoard leaves out what it knows of later ones.
+    """
+
+    def __init__(self, folder: Path, start_step: int = 0) -> None:
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        self._file = GrowingFile(folder / f"events.out.tfevents.{time.time():.0f}.{socket.gethostname()}.{os.getpid()}")
+        self._records = RecordWriter(self._file)
+        self._add(file_version="brain.Event:2")
+        if start_step:
+            self._add(step=start_step + 1, session_log={"status": "START"})
+
+    def record(self, row: Mapping[str, float]) -> None:
+        """Every finite number of a row at its ``step``."""
+        values = [{"tag": name, "simple_value": value} for name, value in row.items() if name != "step" and math.isfinite(value)]
+        self._add(step=int(row["step"]), summary={"value": values})
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _add(self, **content: Any) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event
+
+        self._records.write(Event(wall_time=time.time(), **content).SerializeToString())
 
 
 def require_sound(step: int, losses: Mapping[str, Tensor]) -> None:

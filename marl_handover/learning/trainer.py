@@ -15,8 +15,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from marl_handover.compose import to_yaml
-from marl_handover.errors import CheckpointMismatch, CorruptFile, InvalidSetting
-from marl_handover.files import write_whole
+from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, first_line
+from marl_handover.files import remove_temporaries, write_whole
 from marl_handover.learning.algorithm import subnormals_flushed
 from marl_handover.learning.algorithm_settings import OffPolicyConfig, PpoConfig
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
@@ -25,6 +25,7 @@ from marl_handover.learning.experience import Collected
 from marl_handover.learning.recorder import Recorder, require_sound
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.variants import make_variant
+from marl_handover.locks import claimed
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome
@@ -87,8 +88,18 @@ class Trainer:
         self.best: dict[str, Any] = {}  # the actor that did best on the validation problems of the last stage, its score and step
 
     def run(self) -> dict[str, Any]:
-        """Train to the end; return (and write) the summary. An interrupted run continues from its last checkpoint."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+        """Train to the end; return (and write) the summary. An interrupted run continues from its last checkpoint.
+
+        Raises:
+            FolderBusy: another process trains in the folder.
+            CannotWrite: there is no room for what it writes; the last checkpoint is whole.
+        """
+        with claimed(self.folder):
+            remove_temporaries(self.folder)
+            self._train()
+            return self._summarise()
+
+    def _train(self) -> None:
         write_whole(self.folder / "config.yaml", to_yaml(self.config))
         recorder = Recorder(self.folder, self.config.steps, self.counters.step, self.config.progress)
         started = time.perf_counter() - self.counters.wall_s
@@ -102,7 +113,6 @@ class Trainer:
             recorder.close()
             self.experience.close()
         self.save()
-        return self._summarise()
 
     def _advance(self) -> None:
         """Collect, and make the gradient steps that are due."""
@@ -254,15 +264,18 @@ class Trainer:
         state = load_checkpoint(self.folder, self.device)
         try:
             self._restore(state)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise CorruptFile("checkpoint", self.folder / FILE, f"its parts do not fit together ({reason})") from error
+        except HandoverError:
+            raise
+        except Exception as error:  # torch and what is made of the parts raise many kinds
+            raise CorruptFile("checkpoint", self.folder / FILE, f"its parts do not fit together ({first_line(error)[:100]})") from error
 
     def _restore(self, state: dict[str, Any]) -> None:
         stored = state["config"]
         if _architecture(stored) != self.config.task.architecture:
             raise CheckpointMismatch(self.folder, "architecture", _architecture(stored), self.config.task.architecture)
         self.counters = Counters(**state["counters"])
+        if not all(isinstance(value, int | float) and 0 <= value < math.inf for value in asdict(self.counters).values()):
+            raise ValueError("its counters are no counts")
         self.algorithm.load_state_dict(state["algorithm"])
         if self.counters.step:
             self._schedule()

@@ -31,8 +31,8 @@ from marl_handover.cell.build import urdf_path
 from marl_handover.cell.cell import REACH_TOLERANCE_MM
 from marl_handover.compose import to_yaml
 from marl_handover.config import MotionConfig, TaskConfig
-from marl_handover.errors import CorruptFile, HandoverError, MissingFile
-from marl_handover.files import temporary_of
+from marl_handover.errors import CannotWrite, CorruptFile, HandoverError, MissingFile
+from marl_handover.files import writing
 from marl_handover.resources import package_path
 from marl_handover.task.rules import MotionCost, straight_line_mm
 
@@ -85,10 +85,8 @@ class CostTable:
 
     def save(self, path: Path) -> None:
         """Write it whole, then rename."""
-        temporary = temporary_of(path)
-        with temporary.open("wb") as stream:
+        with writing(path) as stream:
             np.savez_compressed(stream, **asdict(self))
-        temporary.replace(path)
 
     @staticmethod
     def _seen(cell: Cell, arm: Array, place_mm: Array) -> tuple[Array, Array]:
@@ -256,7 +254,7 @@ def _kept(cell: Cell, motion: MotionConfig, key: str) -> CostTable:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         table.save(path)
-    except OSError as error:
+    except (OSError, CannotWrite) as error:
         print(f"path costs are not kept for the next time: {error}")
     return table
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.config import CellConfig, NoiseConfig, RewardConfig, TaskConfig
-from marl_handover.errors import CorruptFile, MissingFile
+from marl_handover.errors import CorruptFile
+from marl_handover.files import read_arrays
 from marl_handover.task.observations import observation_size
 
 KINDS = {
@@ -23,6 +24,13 @@ KINDS = {
     "turns": "marl_handover.policies.decentralised:TurnsPolicy",
 }
 """Forms of an actor, and the class that evaluates each, imported when it is needed."""
+
+VARIANTS = {"centralised": "centralised", "centralised_box": "centralised", "turns": "decentralised"}
+"""The variant that trains actors of a form; the others are hierarchical."""
+
+LIMIT_BYTES = 100_000_000
+COUNTS = {"layers": (1, 100), "networks": (1, 100), "modes": (1, 1000), "harmonics": (0, 16)}
+"""Least and largest values of the whole numbers that a policy file says of itself."""
 
 Layers = list[tuple[NDArray[np.float32], NDArray[np.float32]]]
 
@@ -40,24 +48,45 @@ def read_policy(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of a policy file; no pickled objects are read.
 
     Raises:
-        MissingFile, CorruptFile: if it is not there, or not whole.
+        MissingFile, CorruptFile: if it is not there, not whole, too large, or no policy (:func:`require_policy`).
     """
-    if not path.exists():
-        raise MissingFile("policy file", path)
+    arrays = read_arrays(path, LIMIT_BYTES, "policy file")
+    require_policy(arrays, path, "policy file")
+    return arrays
+
+
+def require_policy(arrays: Mapping[str, NDArray[Any]], path: Path, what: str) -> None:
+    """See that arrays are a policy: it says what it is, and its weights are real, finite and fit together.
+
+    Raises:
+        CorruptFile: it is none. ``path`` and ``what`` are for the message.
+    """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
         about = json.loads(str(arrays["about"]))
+        _require_known(about)
         for network in range(about.get("networks", 1)):
             _check_chain(network_layers(arrays, about, network))
-        if about["kind"] not in KINDS:
-            raise ValueError(f"its kind is {about['kind']!r}, not one of {', '.join(KINDS)}")
         observation_size(about["layout"])
         stored_settings(about)
-    except Exception as error:  # numpy, zip and json raise many kinds
-        reason = str(error).splitlines()[0] if isinstance(error, (KeyError, TypeError)) or "layer" in str(error) else "damaged or no policy"
-        raise CorruptFile("policy file", path, f"{reason}; export it again") from error
-    return arrays
+    except Exception as error:  # json and the settings raise many kinds
+        reason = str(error)[:100] if isinstance(error, (_NotPolicy, KeyError, TypeError)) else "it is damaged or no policy"
+        raise CorruptFile(what, path, reason) from error
+
+
+class _NotPolicy(ValueError):
+    """What is wrong with it, in words for people."""
+
+
+def _require_known(about: Mapping[str, Any]) -> None:
+    if about["kind"] not in KINDS:
+        raise _NotPolicy(f"its kind is {str(about['kind'])[:40]!r}, not one of {', '.join(KINDS)}")
+    variant = VARIANTS.get(about["kind"], "hierarchical")
+    if about["variant"] != variant:
+        raise _NotPolicy(f"its kind is {about['kind']!r}, of variant {variant}, but it says variant {str(about['variant'])[:40]!r}")
+    for name, (least, most) in COUNTS.items():
+        value = about.get(name, least)
+        if type(value) is not int or not least <= value <= most:
+            raise _NotPolicy(f"its {name} is {str(value)[:40]}, not a number from {least} to {most}")
 
 
 def network_layers(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any], network: int = 0) -> Layers:
@@ -67,9 +96,12 @@ def network_layers(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any],
 
 
 def _check_chain(layers: Layers) -> None:
-    """Raise :class:`ValueError` unless each layer takes what the one before gives."""
-    width = layers[0][0].shape[0]
+    """Raise unless every number is real and finite, and each layer takes what the one before gives."""
+    width = None
     for index, (weight, bias) in enumerate(layers):
-        if weight.shape != (width, len(bias)):
-            raise ValueError(f"layer {index} has shape {weight.shape}")
+        for name, array in (("weight", weight), ("bias", bias)):
+            if array.dtype.kind != "f" or not np.isfinite(array).all():
+                raise _NotPolicy(f"{name} {index} has numbers that are not real and finite ({array.dtype})")
+        if weight.ndim != 2 or bias.shape != weight.shape[1:] or width not in (None, len(weight)):
+            raise _NotPolicy(f"layer {index} has shapes {weight.shape} and {bias.shape}, which do not fit together")
         width = len(bias)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,14 +16,16 @@ from numpy.typing import NDArray
 
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import CellConfig, CentralisedConfig, MotionConfig, TaskConfig
-from marl_handover.errors import CheckpointMismatch, MissingFile, UnknownChoice
+from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, MissingFile, UnknownChoice, first_line
 from marl_handover.motion.cost import motion_cost
 from marl_handover.policies.baselines import ExactPolicy, GreedyPolicy, RandomPolicy
-from marl_handover.policies.files import KINDS, read_policy, stored_settings
+from marl_handover.policies.files import KINDS, read_policy, require_policy, stored_settings
 from marl_handover.policies.policy import SupervisorPolicy
 from marl_handover.policies.shielded import SHIELDED, ShieldedPolicy
 from marl_handover.resources import package_path
 from marl_handover.task.rules import Rules
+
+Arrays = Mapping[str, NDArray[Any]]
 
 BASELINES = ("exact", "random", "greedy")
 NAMES = (*BASELINES, "pretrained_a", "pretrained_b", "pretrained_twin")
@@ -51,12 +54,38 @@ def load(
         made = {"exact": ExactPolicy, "greedy": GreedyPolicy}
         return RandomPolicy(rules, seed) if name == "random" else made[name](rules)
     arrays = _arrays(name)
+    try:
+        policy = _made(name, arrays, cell, task, motion)
+        _try_out(policy)
+    except HandoverError:
+        raise
+    except Exception as error:  # of numbers that are none, of layers that are too narrow, and whatever else such a file can hold
+        raise CorruptFile("policy", name, f"what it holds does not fit together ({first_line(error)[:100]})") from error
+    return policy
+
+
+def _made(name: str, arrays: Arrays, cell: Cell | None, task: TaskConfig | None, motion: MotionConfig | None) -> SupervisorPolicy:
     about = json.loads(str(arrays["about"]))
     own_cell, own_task = stored_settings(about)
     rules = _rules(cell or load_cell(own_cell), task or own_task, motion, about)
     module, _, kind = KINDS[about["kind"]].partition(":")
     policy: SupervisorPolicy = getattr(importlib.import_module(module), kind)(rules, name, arrays, about)
     return policy
+
+
+def _try_out(policy: SupervisorPolicy) -> None:
+    """Ask a policy for two decisions, so that what cannot act is refused when it is loaded. Raises whatever that raises."""
+    cell = policy.rules.cell
+    middle_mm = (cell.r_min_mm + cell.r_max_mm) / 2
+    ahead = [[base.x_mm + middle_mm * math.cos(base.facing_rad), middle_mm * math.sin(base.facing_rad), 0.0] for base in cell.bases]
+    pose = np.array(ahead)
+    with np.errstate(all="ignore"):
+        action = policy.act(pose, pose[::-1], np.arange(len(pose)) - 1)
+    size = policy.rules.action_size
+    if action.shape != (len(pose), size):
+        raise ValueError(f"its answers have the shape {action.shape[1:]}, not ({size},)")
+    if not np.isfinite(action).all() and policy.variant != "decentralised":  # there it means that nobody wants to move
+        raise ValueError("its answers are no numbers")
 
 
 def adapted(
@@ -111,14 +140,16 @@ def _rules(cell: Cell, task: TaskConfig, motion: MotionConfig | None, about: Map
     return Rules(cell, task, motion_cost(cell, task, motion))
 
 
-def _arrays(name: str) -> Mapping[str, NDArray[Any]]:
+def _arrays(name: str) -> Arrays:
     if name in NAMES:
         return read_policy(package_path(f"pretrained/{name.removeprefix('pretrained_')}.npz"))
     path = Path(name)
     if path.is_dir():
         from marl_handover.learning.export import run_arrays
 
-        return run_arrays(path)
+        arrays = run_arrays(path)
+        require_policy(arrays, path, "policy of the run")
+        return arrays
     if path.suffix == ".npz":
         return read_policy(path)
     if path.exists() or path.parent != Path():

@@ -13,7 +13,7 @@ import pytest
 
 from marl_handover.cli import main
 from marl_handover.compare import runs
-from marl_handover.compare.locks import held
+from marl_handover.locks import held
 
 SUITE = """
 title: Small

@@ -174,7 +174,7 @@ def test_a_task_that_another_process_is_at_is_left_alone_until_that_ends(tmp_pat
     tasks = planned(tmp_path, SUITE.replace("{name: b, train: []}", "{name: greedy, policy: greedy}"))
     task = tasks["greedy"]
     code = (
-        "import sys; from pathlib import Path; from marl_handover.compare.locks import held\n"
+        "import sys; from pathlib import Path; from marl_handover.locks import held\n"
         "with held(Path(sys.argv[1])) as mine: print(mine, flush=True); sys.stdin.read()"
     )
     other = subprocess.Popen([sys.executable, "-c", code, str(task.folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
