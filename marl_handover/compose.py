@@ -28,6 +28,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from marl_handover.bounds import check_bounds
 from marl_handover.compose_help import keys_help
 from marl_handover.compose_schema import Groups, Keys, SchemaTree, fitted, load_mapping, option_file, without_none
 from marl_handover.errors import BadOverride, CorruptFile, HandoverError, UnknownChoice
@@ -182,13 +183,15 @@ class _Composer:
         return self.finish()
 
     def finish(self) -> Any:
-        """The typed instance."""
+        """The typed instance, every value within its bounds."""
         try:
-            return OmegaConf.to_object(self.tree.config)
+            config = OmegaConf.to_object(self.tree.config)
         except MissingMandatoryValue as error:
             raise BadOverride(f"{error.full_key}=…", "this setting has no default and must be given") from error
         except OmegaConfBaseException as error:
             raise BadOverride(error.full_key or "configuration", _reason(error)) from error
+        check_bounds(config)
+        return config
 
     def assign_tree(self, keys: Keys, tree: Mapping[Any, Any], file: Path | None) -> None:
         """Merge a nested mapping below ``keys``."""

@@ -124,12 +124,13 @@ class OutOfReach(HandoverError):
         )
 
 
-class NotFinite(HandoverError):
+class NotFinite(InvalidSetting):
     """A number that must be finite is NaN or infinite."""
 
     def __init__(self, what: str, value: Any) -> None:
-        super().__init__(f"{what} = {value}: every number must be finite")
-        self.what, self.value = what, value
+        HandoverError.__init__(self, f"{what} = {value}: every number must be finite")
+        self.what = self.name = what
+        self.value, self.limit = value, "finite"
 
 
 class Diverged(WorkFailed):

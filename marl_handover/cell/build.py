@@ -9,7 +9,7 @@ from marl_handover.cell.cell import Cell, mirrored_pair
 from marl_handover.cell.chart import Chart
 from marl_handover.cell.spaces import AnnulusFit, ManipulationGrid, fit_annulus, manipulation_grid
 from marl_handover.compose import from_yaml, to_yaml
-from marl_handover.config import CellConfig, require_at_least, require_between, require_choice, require_positive
+from marl_handover.config import CellConfig, check_bounds, require_choice
 from marl_handover.errors import MissingFile
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.urdf import read_urdf
@@ -42,10 +42,7 @@ def build_cell(config: CellConfig) -> CellModel:
     Raises:
         InvalidSetting, MissingFile, UrdfError, NoSharedSpace: where a setting, the URDF or the geometry cannot be.
     """
-    for name in ("base_distance_mm", "pick_height_mm", "grid_mm"):
-        require_positive(f"cell.{name}", getattr(config, name))
-    require_at_least("cell.fit_rounding_mm", config.fit_rounding_mm, 0)
-    require_between("cell.chart_inset", config.chart_inset, 0.1, 1)
+    check_bounds(config, "cell.")
     arm = ClosedFormArm(read_urdf(urdf_path(config.urdf), config.grasp_link), config.joint_limits_deg)
     bases = mirrored_pair(config.base_distance_mm)
     grid = manipulation_grid(arm, config, bases)

@@ -11,7 +11,7 @@ import numpy as np
 
 from marl_handover.cell import build_cell
 from marl_handover.commands.person import Person, confirmed
-from marl_handover.config import CellConfig, MotionConfig, require_between, require_choice, require_positive
+from marl_handover.config import CellConfig, MotionConfig, bounded, check_bounds, chosen, seed_field
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.settings import ARMS
 from marl_handover.runtime.settings import LabConfig
@@ -38,12 +38,12 @@ WHAT = ("all", "camera", "servos", "grippers", "sheets")
 class CalibrateCommand(LabConfig):
     """Settings of ``calibrate``; files go to ``calibration=DIR``."""
 
-    what: str = "all"  # camera, servos (needs the camera's), grippers (needs both), all, or sheets: writes what has to be printed
-    paper: str = "a4"  # of the sheets: a4, a3 or letter
-    postures: int = 60  # of each arm
-    worst_mm: float = 3.0  # servos that explain the sightings no better are not saved
-    views: int = 20  # of the board, held before the camera
-    seed: int = 0  # of the postures
+    what: str = chosen("all", WHAT)  # camera, servos (needs camera), grippers (needs both), all, or sheets: what has to be printed
+    paper: str = chosen("a4", ("a4", "a3", "letter"))  # of the sheets: a4, a3 or letter
+    postures: int = bounded(60, 12, 500)  # of each arm
+    worst_mm: float = bounded(3.0, 0.01, 100.0)  # servos that explain the sightings no better are not saved
+    views: int = bounded(20, 8, 200)  # of the board, held before the camera
+    seed: int = seed_field()  # of the postures
     cell: CellConfig = field(default_factory=CellConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
 
@@ -57,10 +57,7 @@ def run(config: CalibrateCommand) -> int:
     """Go through the procedures and save what they give."""
     from marl_handover.runtime.lab import plug_in
 
-    require_choice("what", config.what, WHAT)
-    require_between("postures", config.postures, 12, 500)
-    require_between("views", config.views, 8, 200)
-    require_positive("worst_mm", config.worst_mm)
+    check_bounds(config)
     model = build_cell(config.cell)
     if config.what == "sheets":
         config.board.validate()

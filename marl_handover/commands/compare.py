@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from marl_handover.config import require_at_least, require_choice
+from marl_handover.config import bounded, check_bounds, chosen, path_field
 from marl_handover.errors import InvalidSetting, UnknownChoice, WorkFailed
 
 if TYPE_CHECKING:
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 class CompareConfig:
     """Keys of ``compare``."""
 
-    suite: str = "paper"  # paper, variants, ablations, or a YAML file
+    suite: str = path_field("paper")  # paper, variants, ablations, or a YAML file
     preset: str = "full"  # full or quick, a smoke size
     rows: list[str] = field(default_factory=list)  # some of its rows; []: all
-    seeds: int = 0  # of every row; 0: as the suite has it; an evaluation that the suite gives fewer keeps to those
-    out: str = ""  # folder of runs and results, shared by all machines; runs/compare/<suite>, with -quick
+    seeds: int = bounded(0, 0, 1000)  # of every row; 0: as the suite has it; an evaluation that the suite gives fewer keeps to those
+    out: str = path_field()  # folder of runs and results, shared by all machines; runs/compare/<suite>, with -quick
     fresh: list[str] = field(default_factory=list)  # rows, or row/evaluation, whose results are thrown away and made anew
     report_only: bool = False  # run nothing: tables and figures of what is there
-    launcher: str = "loky"  # loky: the cores of this machine; ray: a cluster
+    launcher: str = chosen("loky", ("loky", "ray"))  # loky: the cores of this machine; ray: a cluster
     address: str = ""  # of the Ray cluster: auto, host:port or local
-    jobs: int = 0  # runs at the same time; 0: one a core
+    jobs: int = bounded(0, 0, 1024)  # runs at the same time; 0: one a core
     progress: bool = True
 
 
@@ -52,6 +52,7 @@ def run(config: CompareConfig) -> int:
     from marl_handover.compare.suite import load_suite
 
     require_statistics()
+    check_bounds(config)
     whole = load_suite(config.suite).sized(config.preset)
     suite = whole.with_rows(config.rows)
     if config.seeds:
@@ -71,8 +72,6 @@ def run(config: CompareConfig) -> int:
 
 def _check(config: CompareConfig, suite: Suite) -> None:
     """Refuse keys that name nothing, or that nothing would look at."""
-    from marl_handover.compare.launch import LAUNCHERS
-
     known = [row.name for row in suite.rows]
     for row in suite.rows:
         specs = [spec for seed in suite.seeds_of(row) for spec in suite.evaluations_of(row, seed)]
@@ -82,8 +81,6 @@ def _check(config: CompareConfig, suite: Suite) -> None:
             raise UnknownChoice("fresh", name, known)
     if config.report_only and config.fresh:
         raise InvalidSetting("fresh", config.fresh, "left out with report_only=true, which makes nothing anew")
-    require_choice("launcher", config.launcher, LAUNCHERS)
-    require_at_least("jobs", config.jobs, 0)
     if config.address and config.launcher == "loky":
         raise InvalidSetting("address", config.address, "left out with launcher=loky; it is that of a Ray cluster")
 

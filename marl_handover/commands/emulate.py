@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from marl_handover.config import require_choice, require_seed
+from marl_handover.config import path_field, require_choice, require_seed
 from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.settings import HardwareConfig
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class EmulateConfig:
     """Keys of ``emulate``."""
 
-    link: str = "runs/ssc32"  # symlink to the port; give it as hardware.boards.main.port to a run
+    link: str = path_field("runs/ssc32")  # symlink to the port; give it as hardware.boards.main.port to a run
     faults: str = ""  # kind@start_s[:duration_s][=amount], separated by commas; kinds: unplug brownout silent drop corrupt late stuck jam
     board: str = "main"  # which of the boards in hardware.boards
     lines: bool = False  # print every line that comes in

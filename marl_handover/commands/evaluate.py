@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from marl_handover.config import path_field
 from marl_handover.errors import InvalidSetting, MissingFile
 from marl_handover.files import write_whole
 from marl_handover.learning.evaluation import Evaluation
@@ -20,8 +21,8 @@ from marl_handover.task.rules import Outcome
 class EvaluateCommand(AssessmentConfig):
     """Settings of ``evaluate``."""
 
-    json: str = ""  # file for the result
-    trace: str = ""  # file for every transfer
+    json: str = path_field()  # file for the result
+    trace: str = path_field()  # file for every transfer
     progress: bool = True
 
 

@@ -13,7 +13,21 @@ from numpy.typing import NDArray
 from marl_handover.arrays import wrap
 from marl_handover.cell import NO_ARM
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.config import CellConfig, MotionConfig, NoiseConfig, changed, require_seed
+from marl_handover.config import (
+    ARCHITECTURES,
+    EPSILON_DEG,
+    POSE,
+    SYMMETRY_ORDER,
+    CellConfig,
+    MotionConfig,
+    NoiseConfig,
+    bounded,
+    changed,
+    check_bounds,
+    chosen,
+    path_field,
+    seed_field,
+)
 from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, WorkFailed
 from marl_handover.learning.rollout import nobody_moves
 from marl_handover.policies import SupervisorPolicy, adapted
@@ -34,18 +48,18 @@ REASONS = {OUT_OF_REACH: "out of this arm's reach", MOTION: "the policy's motion
 class PlanConfig:
     """Keys of ``plan``. A trained policy brings its own cell and task; what is null here stays as it brought it."""
 
-    start: list[float] = field(default_factory=lambda: [-120.0, -60.0, 0.0])  # x [mm], y [mm], orientation [deg]
-    goal: list[float] = field(default_factory=lambda: [150.0, 60.0, 90.0])  # x [mm], y [mm], orientation [deg]
-    policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, pretrained_twin, a run directory or a policy file
+    start: list[float] = bounded([-120.0, -60.0, 0.0], *POSE)  # x [mm], y [mm], orientation [deg]
+    goal: list[float] = bounded([150.0, 60.0, 90.0], *POSE)  # x [mm], y [mm], orientation [deg]
+    policy: str = path_field("exact")  # exact, random, greedy, pretrained_a or _b or _twin, a run directory or a policy file
     cell: CellConfig | None = None  # null: the policy's own, or paper; single keys change the paper cell
-    architecture: str | None = None  # A or B; null: the policy's own, or B
-    epsilon_deg: float | None = None  # allowed orientation error; null: the policy's own, or 5
-    symmetry_order: int | None = None  # the block looks the same when turned by 360/k deg; null: the policy's own, or 1
-    seed: int = 0  # of policy=random
-    json: str = ""  # file for the sequence
-    picture: str = ""  # file for a picture of the sequence: .png, .pdf or .svg
-    motion: str = ""  # file for the arms' motions: timed joint trajectories of every transfer
-    motion_picture: str = ""  # file for a picture of them: .png, .pdf or .svg
+    architecture: str | None = chosen(None, ARCHITECTURES)  # A or B; null: the policy's own, or B
+    epsilon_deg: float | None = bounded(None, *EPSILON_DEG)  # allowed orientation error; null: the policy's own, or 5
+    symmetry_order: int | None = bounded(None, *SYMMETRY_ORDER)  # same look when turned by 360/k deg; null: the policy's own, or 1
+    seed: int = seed_field()  # of policy=random
+    json: str = path_field()  # file for the sequence
+    picture: str = path_field()  # file for a picture of the sequence: .png, .pdf or .svg
+    motion: str = path_field()  # file for the arms' motions: timed joint trajectories of every transfer
+    motion_picture: str = path_field()  # file for a picture of them: .png, .pdf or .svg
     arm_motion: MotionConfig = field(default_factory=MotionConfig)  # how the arms move, for motion and motion_picture
 
 
@@ -64,7 +78,7 @@ def run(config: PlanConfig) -> int:
     for name in ("json", "picture", "motion", "motion_picture"):
         if getattr(config, name) and Path(getattr(config, name)).is_dir():
             raise InvalidSetting(name, getattr(config, name), "a file, not a folder")
-    require_seed(config.seed)
+    check_bounds(config)
     poses = {name: _pose(name, getattr(config, name)) for name in ("start", "goal")}
     policy = _policy(config)
     rules = policy.rules

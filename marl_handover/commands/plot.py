@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from marl_handover.config import CellConfig, MotionConfig, require_at_least, require_choice
+from marl_handover.config import SYMMETRY_ORDER, CellConfig, MotionConfig, bounded, check_bounds, chosen, path_field
 from marl_handover.errors import CorruptFile, InvalidSetting, UnknownChoice
 
 Figure = Any
@@ -23,16 +23,16 @@ WROTE = {"plan": "plan json=FILE", "motion": "plan motion=FILE", "evaluation": "
 class PlotConfig:
     """Keys of ``plot``."""
 
-    kind: str = "run"  # run, workspace, plan, motion, evaluation, errors, confusion or compare
-    run: str = ""  # kind=run: a run directory, or several seeds: [A,B]
-    json: str = ""  # kind=plan, motion, evaluation: what that command wrote with json=FILE or motion=FILE
-    trace: str = ""  # kind=errors, confusion: trace=FILE of evaluate; of confusion also two, [A,B]; kind=evaluation: adds a histogram
-    suite: str = ""  # kind=compare: folder of a suite that compare wrote
+    kind: str = chosen("run", KINDS)  # run, workspace, plan, motion, evaluation, errors, confusion or compare
+    run: str = path_field()  # kind=run: a run directory, or several seeds: [A,B]
+    json: str = path_field()  # kind=plan, motion, evaluation: what that command wrote with json=FILE or motion=FILE
+    trace: str = path_field()  # kind=errors, confusion: trace=FILE of evaluate; of confusion also [A,B]; kind=evaluation: adds a histogram
+    suite: str = path_field()  # kind=compare: folder of a suite that compare wrote
     figure: str = ""  # kind=compare: one of its figures; all if empty
-    scale: str = "log"  # kind=errors: log or linear
-    symmetry_order: int | None = None  # of the block in the trace; null: as the file says, or 1
+    scale: str = chosen("log", ("log", "linear"))  # kind=errors: log or linear
+    symmetry_order: int | None = bounded(None, *SYMMETRY_ORDER)  # of the block in the trace; null: as the file says, or 1
     cell: CellConfig | None = None  # null: the file's own, or paper
-    out: str = ""  # .png, .pdf or .svg; learning.png in the run directory, or beside the file; of a whole suite: a folder
+    out: str = path_field()  # .png, .pdf or .svg; learning.png in the run directory, or beside the file; of a whole suite: a folder
 
 
 SCHEMA: type = PlotConfig
@@ -44,9 +44,7 @@ def run(config: PlotConfig) -> int:
     """Draw one figure, or those of a suite, and say where it is."""
     from marl_handover.report.files import require_picture, save_figure
 
-    require_choice("kind", config.kind, KINDS)
-    if config.symmetry_order is not None:
-        require_at_least("symmetry_order", config.symmetry_order, 1)
+    check_bounds(config)
     whole_suite = config.kind == "compare" and not config.figure
     if config.out and not whole_suite:
         require_picture("out", config.out)
@@ -157,10 +155,9 @@ def _transfers(config: PlotConfig, result: dict[str, Any]) -> tuple[Any, Any]:
 
 
 def _errors(config: PlotConfig) -> tuple[Figure, Path]:
-    from marl_handover.report.errors import SCALES, errors_figure
+    from marl_handover.report.errors import errors_figure
     from marl_handover.report.traces import symmetry_of
 
-    require_choice("scale", config.scale, SCALES)
     path, trace = _traces(config, 1)[0]
     order = symmetry_of(trace, config.symmetry_order)
     return errors_figure(trace, order, config.scale, path.stem), path.with_name(f"{path.stem}_errors.png")

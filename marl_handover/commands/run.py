@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from marl_handover import policies
 from marl_handover.commands.person import confirmed, laid_anew
-from marl_handover.config import CellConfig, LoopConfig, MotionConfig, TaskChanges, require_at_least, require_seed
+from marl_handover.config import POSE, CellConfig, LoopConfig, MotionConfig, TaskChanges, bounded, check_bounds, path_field, seed_field
 from marl_handover.errors import InvalidSetting, MissingFile, OutOfReach
 from marl_handover.runtime.settings import LabConfig
 
@@ -30,15 +30,15 @@ Floats = NDArray[np.float64]
 class RunCommand(LabConfig):
     """Settings of ``run``."""
 
-    policy: str = "pretrained_twin"  # exact, random, greedy, pretrained_a, pretrained_b, pretrained_twin, a run directory or a policy file
-    episodes: int = 1  # of a real cell with a terminal: before each but the first somebody lays the block anew and presses Enter
-    seed: int = 0  # of the twin's problems
-    start: list[float] | None = None  # of the twin's block: x [mm], y [mm], orientation [deg]; null: random
-    goal: list[float] | None = None  # the same; null: of the twin random, of a real cell the printed marker
+    policy: str = path_field("pretrained_twin")  # exact, random, greedy, pretrained_a or _b or _twin, a run directory or a policy file
+    episodes: int = bounded(1, 1, 10**6)  # before each but the first of a real cell somebody lays the block anew and presses Enter
+    seed: int = seed_field()  # of the twin's problems
+    start: list[float] | None = bounded(None, *POSE)  # of the twin's block: x [mm], y [mm], orientation [deg]; null: random
+    goal: list[float] | None = bounded(None, *POSE)  # the same; null: of the twin random, of a real cell the printed marker
     printed: bool = False  # of the twin: the goal is a printed marker that the camera has to see
     dry_run: bool = False  # everything but the last write: nothing moves
-    log: str = ""  # file for every event, JSON Lines
-    publish: str = ""  # folder in which the session shows itself to marl-handover view live=FOLDER; empty: it does not
+    log: str = path_field()  # file for every event, JSON Lines
+    publish: str = path_field()  # folder in which the session shows itself to marl-handover view live=FOLDER; empty: it does not
     view_control: bool = False  # whether that folder's pages may pause the session and give it goals; they may always stop it
     paused: bool = False  # with view_control: nothing moves before somebody presses start
     real_time: bool = False  # of the twin: no faster than the arms would be
@@ -87,12 +87,7 @@ def run(config: RunCommand) -> int:
 
 
 def _check(config: RunCommand) -> None:
-    require_at_least("episodes", config.episodes, 1)
-    require_seed(config.seed)
-    for name in ("start", "goal"):
-        value = getattr(config, name)
-        if value is not None and (len(value) != 3 or not np.isfinite(value).all()):
-            raise InvalidSetting(name, value, "x [mm], y [mm], orientation [deg]")
+    check_bounds(config)
     if config.start is not None and not config.emulated:
         raise InvalidSetting("start", config.start, "left out with a real cell: its block lies where it lies")
     if config.printed and not config.emulated:

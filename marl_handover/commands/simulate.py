@@ -17,7 +17,7 @@ from marl_handover import policies
 from marl_handover.arrays import wrap
 from marl_handover.cell import Cell, build_cell
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.config import CellConfig, MotionConfig, TaskChanges, require_at_least, require_seed
+from marl_handover.config import POSE, CellConfig, MotionConfig, TaskChanges, bounded, check_bounds, chosen, path_field, seed_field
 from marl_handover.errors import InvalidSetting, OutOfReach, WorkFailed
 from marl_handover.policies.policy import NobodyMoves
 from marl_handover.task.rules import Outcome
@@ -36,19 +36,19 @@ Floats = NDArray[np.float64]
 class SimulateCommand:
     """Settings of ``simulate``. What is not given is the policy's own, or the default."""
 
-    policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, pretrained_twin, a run directory or a policy file
-    episodes: int = 1  # played one after the other; each ends at the first verdict
-    seed: int = 0  # of the problems
-    start: list[float] | None = None  # x [mm], y [mm], orientation [deg]; null: random
-    goal: list[float] | None = None  # the same; null: random
+    policy: str = path_field("exact")  # exact, random, greedy, pretrained_a or _b or _twin, a run directory or a policy file
+    episodes: int = bounded(1, 1, 10**6)  # played one after the other; each ends at the first verdict
+    seed: int = seed_field()  # of the problems
+    start: list[float] | None = bounded(None, *POSE)  # x [mm], y [mm], orientation [deg]; null: random
+    goal: list[float] | None = bounded(None, *POSE)  # the same; null: random
     cell: CellConfig | None = None  # single keys change the paper cell
     task: TaskChanges = field(default_factory=TaskChanges)  # but for the noise: physics decides
     motion: MotionConfig = field(default_factory=MotionConfig)
-    grasp: str = "friction"  # friction, or constraint: a rigid joint while both fingers are on the pin
-    video: str = ""  # .mp4 or .gif
-    fps: float = 12.5  # of the video, in simulated time
-    size: list[int] = field(default_factory=lambda: [640, 480])  # of the video: width, height in pixels
-    view: str = "overview"  # of the video: overview, or top (the cell's camera)
+    grasp: str = chosen("friction", ("friction", "constraint"))  # friction, or constraint: a rigid joint while both fingers are on the pin
+    video: str = path_field()  # .mp4 or .gif
+    fps: float = bounded(12.5, 1.0, 50.0)  # of the video, in simulated time
+    size: list[int] = bounded([640, 480], 16, 4096, (2, 2))  # of the video: width, height in pixels
+    view: str = chosen("overview", ("overview", "top"))  # of the video: overview, or top (the cell's camera)
     captions: bool = True  # of the video: transfer, arm and error below the picture, what the arms reach on the table
     gui: bool = False  # open PyBullet's window
     progress: bool = True
@@ -98,25 +98,14 @@ def run(config: SimulateCommand) -> int:
 
 def _check(config: SimulateCommand) -> None:
     """Raise for settings that cannot be, before anything is built."""
-    from marl_handover.config import require_between, require_choice
-    from marl_handover.simulation.camera import VIEWS
     from marl_handover.simulation.film import picture_size
     from marl_handover.simulation.video import require_video
-    from marl_handover.simulation.world import GRASPS
 
-    require_at_least("episodes", config.episodes, 1)
-    require_seed(config.seed)
-    require_choice("grasp", config.grasp, GRASPS)
-    require_choice("view", config.view, VIEWS)
-    require_between("fps", config.fps, 1, 50)
-    if len(config.size) != 2 or not all(16 <= side <= 4096 and side % 2 == 0 for side in config.size):
+    check_bounds(config)
+    if not all(side % 2 == 0 for side in config.size):
         raise InvalidSetting("size", list(config.size), "two even numbers of pixels, 16 to 4096: [width, height]")
     if picture_size((config.size[0], config.size[1]), config.captions)[1] < 8:
         raise InvalidSetting("size", list(config.size), "higher, to have room for the words below the picture; or captions=false")
-    for name in ("start", "goal"):
-        pose = getattr(config, name)
-        if pose is not None and not (len(pose) == 3 and all(math.isfinite(number) for number in pose)):
-            raise InvalidSetting(name, list(pose), "three finite numbers: [x_mm, y_mm, degrees]")
     if config.task.noise is not None:
         raise InvalidSetting("task.noise", asdict(config.task.noise), "left out: physics decides")
     config.motion.validate()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from marl_handover.config import require_at_least
+from marl_handover.config import bounded, check_bounds
 from marl_handover.errors import InvalidSetting, WorkFailed
 from marl_handover.hardware.settings import HardwareConfig
 
@@ -33,7 +33,7 @@ class StopCommand:
 
     reason: str = "marl-handover stop"  # is shown by whoever is stopped
     clear: bool = False  # allow motion again; nothing moves by itself
-    wait_s: float = 1.0  # for every session to say that it has stopped
+    wait_s: float = bounded(1.0, 0.0, 3600.0)  # for every session to say that it has stopped
     hardware: HardwareConfig = field(default_factory=HardwareConfig)  # with a stop_file: stop only what looks at that one
 
 
@@ -51,7 +51,7 @@ def run(config: StopCommand) -> int:
     from marl_handover.hardware.latch import StopLatch
     from marl_handover.hardware.roll import Roll
 
-    require_at_least("wait_s", config.wait_s, 0)
+    check_bounds(config)
     given, roll = config.hardware.stop_file, Roll()
     path = Path(config.hardware.stop_path())
     if given and not path.is_absolute():

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from marl_handover.commands import train
-from marl_handover.config import require_at_least, require_choice
+from marl_handover.config import bounded, check_bounds, chosen, path_field
 from marl_handover.errors import InvalidSetting
 from marl_handover.files import write_whole
 from marl_handover.learning.settings import TrainConfig
@@ -31,19 +31,19 @@ STUDY_FILE = "study.txt"
 class TuneConfig(TrainConfig):
     """Settings of ``tune``: those of the trials' training, which the search starts from, and its own."""
 
-    search: str = ""  # ranges to search in: a name or a YAML file; the algorithm's own if empty
+    search: str = path_field()  # ranges to search in: a name or a YAML file; the algorithm's own if empty
     fixed: list[str] = field(default_factory=list)  # keys of the search space that are left as they are
-    trials: int = 20  # that the study has in the end; a call does those that are left
+    trials: int = bounded(20, 1, 100_000)  # that the study has in the end; a call does those that are left
     study: str = ""  # its name in the storage; the algorithm's if empty
     storage: str = ""  # postgresql://user:password@host/name, sqlite:///file or a journal file's path; <out>/study.journal if empty
-    pruner: str = "median"  # what ends hopeless trials: median, hyperband or none
-    launcher: str = "loky"  # loky: the cores of this machine; ray: a cluster
+    pruner: str = chosen("median", ("median", "hyperband", "none"))  # what ends hopeless trials: median, hyperband or none
+    launcher: str = chosen("loky", ("loky", "ray"))  # loky: the cores of this machine; ray: a cluster
     address: str = ""  # of the Ray cluster: auto, host:port or local
-    jobs: int = 0  # trials at the same time; 0: one a core
-    steps: int = 16_000  # of each trial
-    evaluation_interval: int = 2_000  # environment steps; after each, a trial may be ended
-    evaluation_episodes: int = 1_000
-    checkpoint_interval: int = 16_000  # environment steps
+    jobs: int = bounded(0, 0, 1024)  # trials at the same time; 0: one a core
+    steps: int = bounded(16_000, 1, 10**9)  # of each trial
+    evaluation_interval: int = bounded(2_000, 1, 10**9)  # environment steps; after each, a trial may be ended
+    evaluation_episodes: int = bounded(1_000, 1, 10**6)
+    checkpoint_interval: int = bounded(16_000, 1, 10**9)  # environment steps
 
 
 SCHEMA = TuneConfig
@@ -73,16 +73,12 @@ def run(config: TuneConfig) -> int:
 
 def _search(config: TuneConfig) -> tuple[Search, Path]:
     """What to do, checked, and the folder for it."""
-    from marl_handover.compare.launch import LAUNCHERS
-    from marl_handover.compare.tune import PRUNERS, Search
+    from marl_handover.compare.tune import Search
     from marl_handover.compare.tune_space import load_space
     from marl_handover.compare.tune_storage import located
     from marl_handover.compose_schema import option_file
 
-    require_choice("pruner", config.pruner, PRUNERS)
-    require_choice("launcher", config.launcher, LAUNCHERS)
-    require_at_least("trials", config.trials, 1)
-    require_at_least("jobs", config.jobs, 0)
+    check_bounds(config)
     if config.address and config.launcher == "loky":
         raise InvalidSetting("address", config.address, "left out with launcher=loky; it is that of a Ray cluster")
     if config.resume:

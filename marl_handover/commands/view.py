@@ -11,7 +11,18 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from marl_handover.config import CellConfig, MotionConfig, TaskChanges, TaskConfig, require_between, require_choice, require_seed
+from marl_handover.config import (
+    CellConfig,
+    MotionConfig,
+    TaskChanges,
+    TaskConfig,
+    bounded,
+    check_bounds,
+    chosen,
+    path_field,
+    require_between,
+    seed_field,
+)
 from marl_handover.errors import InvalidSetting, MissingFile
 
 if TYPE_CHECKING:
@@ -39,13 +50,13 @@ class Page(NamedTuple):
 class ViewCommand:
     """Settings of ``view``. The page is served to this machine only; from elsewhere: ssh -L 8080:localhost:8080 HOST."""
 
-    mode: str | None = None  # play, trace or live; null: trace with trace=FILE, live with live=FOLDER, else play
-    trace: str = ""  # what evaluate wrote with trace=FILE, or run with log=FILE
-    live: str = ""  # the folder of a session that runs with publish=FOLDER
-    port: int = 8080  # 0: any that is free
-    policy: str = "exact"  # of play: exact, random, greedy, pretrained_a, pretrained_b, pretrained_twin, a run directory or a policy file
-    seed: int = 0  # of the problems to play
-    speed: float = 1.0  # simulated seconds in one second
+    mode: str | None = chosen(None, MODES)  # play, trace or live; null: trace with trace=FILE, live with live=FOLDER, else play
+    trace: str = path_field()  # what evaluate wrote with trace=FILE, or run with log=FILE
+    live: str = path_field()  # the folder of a session that runs with publish=FOLDER
+    port: int = bounded(8080, 0, 65535)  # 0: any that is free
+    policy: str = path_field("exact")  # of play: exact, random, greedy, pretrained_a or _b or _twin, a run directory or a policy file
+    seed: int = seed_field()  # of the problems to play
+    speed: float = bounded(1.0, 0.25, 20.0)  # simulated seconds in one second
     cell: CellConfig | None = None  # single keys change the paper cell, or the one that the session's log names
     task: TaskChanges = field(default_factory=TaskChanges)
     motion: MotionConfig = field(default_factory=MotionConfig)
@@ -104,7 +115,6 @@ def mode_of(config: ViewCommand) -> str:
     if len(given) > 1:
         raise InvalidSetting("live", config.live, "left out with trace=FILE: a page shows one of them")
     mode = config.mode or (given[0] if given else "play")
-    require_choice("mode", mode, MODES)
     if given and mode != given[0]:
         raise InvalidSetting("mode", mode, f"{given[0]}, or left out, with {given[0]}=...")
     if mode != "play" and not given:
@@ -116,8 +126,7 @@ def _check(config: ViewCommand, mode: str) -> None:
     changed = _changed("", {key: getattr(config, key) for key in UNUSED[mode]}, vars(ViewCommand()))
     for name, value in changed:
         raise InvalidSetting(name, value, f"left out with {mode}=..., which makes no use of it")
-    require_between("port", config.port, 0, 65535)
-    require_seed(config.seed)
+    check_bounds(config)
     config.motion.validate()
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from marl_handover.cell import CellModel, build_cell
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.config import CellConfig
+from marl_handover.config import CellConfig, path_field
 
 FILE, PICTURE = "workspace.json", "workspace.png"
 
@@ -21,7 +21,7 @@ class WorkspaceConfig:
     """Keys of ``workspace``."""
 
     cell: CellConfig = field(default_factory=CellConfig)
-    out: str = "runs/workspace"  # folder of workspace.json and workspace.png
+    out: str = path_field("runs/workspace")  # folder of workspace.json and workspace.png
 
 
 SCHEMA: type = WorkspaceConfig

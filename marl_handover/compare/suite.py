@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from marl_handover.compare.suite_check import MAX_SEEDS, RUN, check
 from marl_handover.compose_schema import load_mapping, option_file
-from marl_handover.config import require_between, require_choice
+from marl_handover.config import bounded, require_between, require_choice
 from marl_handover.errors import CorruptFile, HandoverError, UnknownChoice
 from marl_handover.resources import resource_path
 
@@ -37,7 +37,7 @@ class RowSpec:
     train: list[str] | None = None  # arguments of `train`; [] trains with the defaults; left out: nothing is trained
     policy: str = ""  # a policy by name, for a row that is not trained
     evaluate: list[str] = field(default_factory=list)  # arguments put after those of every evaluation
-    seeds: int = 0  # 0: the suite's
+    seeds: int = bounded(0, 0, MAX_SEEDS)  # 0: the suite's
 
 
 @dataclass
@@ -49,7 +49,7 @@ class EvaluationSpec:
     arguments: list[str] = field(default_factory=list)  # of `evaluate`
     policy: str = ""  # instead of the row's own, such as shielded:{run}; {run} is the row's run directory
     rows: list[str] = field(default_factory=list)  # empty: all
-    seeds: int = 0  # the first so many of a row's runs; 0: all
+    seeds: int = bounded(0, 0, MAX_SEEDS)  # the first so many of a row's runs; 0: all
 
 
 @dataclass
@@ -82,7 +82,7 @@ class TableSpec:
 class QuickSpec:
     """The smoke size: arguments put after all others."""
 
-    seeds: int = 2
+    seeds: int = bounded(2, 1, MAX_SEEDS)
     train: list[str] = field(default_factory=list)
     evaluate: dict[str, list[str]] = field(default_factory=dict)  # by evaluation
 
@@ -93,7 +93,7 @@ class Suite:
 
     name: str
     title: str = ""
-    seeds: int = 5
+    seeds: int = bounded(5, 1, MAX_SEEDS)
     train: list[str] = field(default_factory=list)  # arguments put before every row's own
     rows: list[RowSpec] = field(default_factory=list)
     evaluations: list[EvaluationSpec] = field(default_factory=list)
@@ -192,7 +192,7 @@ def load_suite(name: str) -> Suite:
 @dataclass
 class _Head:
     title: str = ""
-    seeds: int = 5
+    seeds: int = bounded(5, 1, MAX_SEEDS)
     train: list[str] = field(default_factory=list)
 
 

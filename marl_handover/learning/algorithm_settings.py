@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from marl_handover.config import EXPLORATIONS, require_at_least, require_between, require_choice, require_positive
+from marl_handover.config import EXPLORATIONS, LAYOUTS, bounded, check_bounds, chosen
 from marl_handover.errors import InvalidSetting
 
 
@@ -13,23 +13,17 @@ class AlgorithmConfig:
     """What every algorithm has."""
 
     name: str = ""
-    layout: str = "relative"  # observation layout
+    layout: str = chosen("relative", LAYOUTS)  # observation layout
     previous_arm: bool = True  # whether observations say which arm moved last
-    learning_rate: float = 1e-3
-    decay_from: float = 0.5  # fraction of training after which the learning rate falls linearly to zero
-    gamma: float = 0.95
-    reward_scale: float = 0.5
-    batch_size: int = 256
+    learning_rate: float = bounded(1e-3, 1e-8, 10.0)
+    decay_from: float = bounded(0.5, 0.0, 1.0)  # fraction of training after which the learning rate falls linearly to zero
+    gamma: float = bounded(0.95, 1e-3, 1.0)
+    reward_scale: float = bounded(0.5, 1e-6, 1e6)
+    batch_size: int = bounded(256, 1, 65_536)
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` on a value out of its limits."""
-        for name in ("learning_rate", "gamma", "reward_scale", "batch_size"):
-            require_positive(f"algorithm.{name}", getattr(self, name))
-        for name in ("gamma", "decay_from"):
-            require_between(f"algorithm.{name}", getattr(self, name), 0, 1)
-        for name in ("hidden", "actor_hidden", "critic_hidden", "final_hidden"):
-            for width in getattr(self, name, []):
-                require_at_least(f"algorithm.{name}", width, 1)
+        check_bounds(self, "algorithm.")
         if self.layout == "object":
             raise InvalidSetting("algorithm.layout", self.layout, "'raw' or 'relative'; 'object' hides the goal")
 
@@ -38,18 +32,10 @@ class AlgorithmConfig:
 class OffPolicyConfig(AlgorithmConfig):
     """What every algorithm with a replay memory has."""
 
-    learning_starts: int = 1000  # environment steps with uniform actions, before the first update
-    exploration: str = "chart"  # what uniform places are uniform in: chart (alpha and beta), or area (of the table)
-    steps_per_update: float = 8.0  # environment steps for each gradient step
-    tau: float = 0.01  # target smoothing
-
-    def validate(self) -> None:
-        """As the base class, and the replay's pace."""
-        super().validate()
-        require_choice("algorithm.exploration", self.exploration, EXPLORATIONS)
-        require_positive("algorithm.steps_per_update", self.steps_per_update)
-        require_at_least("algorithm.learning_starts", self.learning_starts, 0)
-        require_between("algorithm.tau", self.tau, 0, 1)
+    learning_starts: int = bounded(1000, 0, 10**9)  # environment steps with uniform actions, before the first update
+    exploration: str = chosen("chart", EXPLORATIONS)  # what uniform places are uniform in: chart (alpha and beta), or area (of the table)
+    steps_per_update: float = bounded(8.0, 0.01, 1e6)  # environment steps for each gradient step
+    tau: float = bounded(0.01, 0.0, 1.0)  # target smoothing
 
 
 @dataclass
@@ -57,36 +43,25 @@ class SacConfig(OffPolicyConfig):
     """Hybrid SAC: exact expectation over (arm, final, place mode), tanh-Gaussian places, two temperatures."""
 
     name: str = "sac"
-    actor_hidden: list[int] = field(default_factory=lambda: [128, 128])
-    critic_hidden: list[int] = field(default_factory=lambda: [128, 128])
-    final_hidden: list[int] = field(default_factory=lambda: [64, 64])  # of the critic of finishing
-    modes: int = 1  # place distributions an arm, chosen between like the other discrete branches
+    actor_hidden: list[int] = bounded([128, 128], 1, 4096, (0, 8))
+    critic_hidden: list[int] = bounded([128, 128], 1, 4096, (0, 8))
+    final_hidden: list[int] = bounded([64, 64], 1, 4096, (0, 8))  # of the critic of finishing
+    modes: int = bounded(1, 1, 64)  # place distributions an arm, chosen between like the other discrete branches
     canonical: bool = True  # fold the mirror symmetry M_x into the networks
-    harmonics: int = 2  # doublings of the angles that the networks see
-    candidates: int = 3  # places an arm tried anywhere, and as many nearby; the actor's mean is drawn to the nearest clearly better one
-    candidate_share: float = 0.5  # of the batch
-    candidate_weight: float = 1.0
-    candidate_margin: float = 0.25  # in units of scaled reward
-    greedy_share: float = 0.25  # of the cells, which act without noise
-    random_place: float = 0.1  # share of exploration's places that are drawn anywhere
-    place_entropy_start: float = -2.0  # target entropies fall from start (linearly / geometrically) ...
-    place_entropy_end: float = -5.0
-    branch_entropy_start: float = 0.1
-    branch_entropy_end: float = 0.01
-    entropy_until: float = 0.75  # ... to end at this fraction of training
-    temperature_rate: float = 3e-3
-    initial_temperature: float = 0.1
-
-    def validate(self) -> None:
-        """As the base class, and what only this algorithm has."""
-        super().validate()
-        require_at_least("algorithm.modes", self.modes, 1)
-        for name in ("harmonics", "candidates", "candidate_weight"):
-            require_at_least(f"algorithm.{name}", getattr(self, name), 0)
-        for name in ("candidate_share", "greedy_share", "random_place"):
-            require_between(f"algorithm.{name}", getattr(self, name), 0, 1)
-        for name in ("branch_entropy_start", "branch_entropy_end", "entropy_until", "temperature_rate", "initial_temperature"):
-            require_positive(f"algorithm.{name}", getattr(self, name))
+    harmonics: int = bounded(2, 0, 16)  # doublings of the angles that the networks see
+    candidates: int = bounded(3, 0, 256)  # places an arm tried anywhere, and as many nearby; the actor is drawn to the nearest better one
+    candidate_share: float = bounded(0.5, 0.0, 1.0)  # of the batch
+    candidate_weight: float = bounded(1.0, 0.0, 1e6)
+    candidate_margin: float = bounded(0.25, -1e6, 1e6)  # in units of scaled reward
+    greedy_share: float = bounded(0.25, 0.0, 1.0)  # of the cells, which act without noise
+    random_place: float = bounded(0.1, 0.0, 1.0)  # share of exploration's places that are drawn anywhere
+    place_entropy_start: float = bounded(-2.0, -100.0, 100.0)  # target entropies fall from start (linearly / geometrically) ...
+    place_entropy_end: float = bounded(-5.0, -100.0, 100.0)
+    branch_entropy_start: float = bounded(0.1, 1e-9, 10.0)
+    branch_entropy_end: float = bounded(0.01, 1e-9, 10.0)
+    entropy_until: float = bounded(0.75, 1e-6, 1000.0)  # ... to end at this fraction of training
+    temperature_rate: float = bounded(3e-3, 1e-9, 10.0)
+    initial_temperature: float = bounded(0.1, 1e-9, 1e3)
 
 
 @dataclass
@@ -94,8 +69,8 @@ class BoxSacConfig(OffPolicyConfig):
     """SAC with all four action numbers in one squashed Gaussian, thresholded by the environment, as in the paper."""
 
     name: str = "box_sac"
-    learning_rate: float = 5e-4
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
+    learning_rate: float = bounded(5e-4, 1e-8, 10.0)
+    hidden: list[int] = bounded([256, 256], 1, 4096, (0, 8))
 
 
 @dataclass
@@ -103,20 +78,12 @@ class Td3Config(OffPolicyConfig):
     """TD3 on the boxed action."""
 
     name: str = "td3"
-    learning_rate: float = 5e-4
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
-    policy_delay: int = 2
-    exploration_std: float = 0.3
-    random_action: float = 0.2  # share of exploration actions drawn uniformly
-    target_noise: float = 0.1
-
-    def validate(self) -> None:
-        """As the base class, and what only this algorithm has."""
-        super().validate()
-        require_at_least("algorithm.policy_delay", self.policy_delay, 1)
-        require_between("algorithm.random_action", self.random_action, 0, 1)
-        for name in ("exploration_std", "target_noise"):
-            require_at_least(f"algorithm.{name}", getattr(self, name), 0)
+    learning_rate: float = bounded(5e-4, 1e-8, 10.0)
+    hidden: list[int] = bounded([256, 256], 1, 4096, (0, 8))
+    policy_delay: int = bounded(2, 1, 1000)
+    exploration_std: float = bounded(0.3, 0.0, 10.0)
+    random_action: float = bounded(0.2, 0.0, 1.0)  # share of exploration actions drawn uniformly
+    target_noise: float = bounded(0.1, 0.0, 10.0)
 
 
 @dataclass
@@ -124,25 +91,15 @@ class PpoConfig(AlgorithmConfig):
     """PPO with a clipped objective on the boxed action; on-policy, so no replay and no hindsight."""
 
     name: str = "ppo"
-    learning_rate: float = 5e-4
-    batch_size: int = 512
-    rollout_steps: int = 32  # environment steps a cell between updates
-    epochs: int = 4
-    gae_lambda: float = 0.95
-    clip: float = 0.2
-    entropy: float = 0.003
-    max_grad_norm: float = 0.5
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
-
-    def validate(self) -> None:
-        """As the base class, and what only this algorithm has."""
-        super().validate()
-        for name in ("rollout_steps", "epochs"):
-            require_at_least(f"algorithm.{name}", getattr(self, name), 1)
-        for name in ("clip", "max_grad_norm"):
-            require_positive(f"algorithm.{name}", getattr(self, name))
-        require_between("algorithm.gae_lambda", self.gae_lambda, 0, 1)
-        require_at_least("algorithm.entropy", self.entropy, 0)
+    learning_rate: float = bounded(5e-4, 1e-8, 10.0)
+    batch_size: int = bounded(512, 1, 65_536)
+    rollout_steps: int = bounded(32, 1, 4096)  # environment steps a cell between updates
+    epochs: int = bounded(4, 1, 1000)
+    gae_lambda: float = bounded(0.95, 0.0, 1.0)
+    clip: float = bounded(0.2, 1e-6, 1e3)
+    entropy: float = bounded(0.003, 0.0, 1e3)
+    max_grad_norm: float = bounded(0.5, 1e-9, 1e9)
+    hidden: list[int] = bounded([256, 256], 1, 4096, (0, 8))
 
 
 @dataclass
@@ -150,25 +107,19 @@ class DqnConfig(OffPolicyConfig):
     """Double DQN over a grid of places: the discretised predecessor, reconstructed from the paper's few words about it."""
 
     name: str = "dqn"
-    layout: str = "raw"
-    learning_rate: float = 5e-4
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
-    grid_mm: float = 20.0  # spacing of the places
-    random_start: float = 1.0  # share of random decisions, falling linearly from start ...
-    random_end: float = 0.05
-    random_until: float = 0.5  # ... to end at this fraction of training
-    shaping: float = 0.0  # reward for coming half a turn nearer to an orientation that an arm can finish with; potential-based
-    finishing_first: int = 0  # of architecture B: gradient steps that only train when to finish, before all others
+    layout: str = chosen("raw", LAYOUTS)
+    learning_rate: float = bounded(5e-4, 1e-8, 10.0)
+    hidden: list[int] = bounded([256, 256], 1, 4096, (0, 8))
+    grid_mm: float = bounded(20.0, 2.0, 200.0)  # spacing of the places
+    random_start: float = bounded(1.0, 0.0, 1.0)  # share of random decisions, falling linearly from start ...
+    random_end: float = bounded(0.05, 0.0, 1.0)
+    random_until: float = bounded(0.5, 1e-6, 1000.0)  # ... to end at this fraction of training
+    shaping: float = bounded(0.0, 0.0, 1e6)  # potential-based reward for half a turn towards an orientation an arm can finish with
+    finishing_first: int = bounded(0, 0, 10**9)  # of architecture B: gradient steps that only train when to finish, before all others
 
     def validate(self) -> None:
         """As the base class, and what only this algorithm has."""
         super().validate()
-        require_positive("algorithm.grid_mm", self.grid_mm)
-        require_positive("algorithm.random_until", self.random_until)
-        for name in ("random_start", "random_end"):
-            require_between(f"algorithm.{name}", getattr(self, name), 0, 1)
-        for name in ("shaping", "finishing_first"):
-            require_at_least(f"algorithm.{name}", getattr(self, name), 0)
         if self.exploration != "chart":
             raise InvalidSetting("algorithm.exploration", self.exploration, "'chart' for algorithm=dqn, whose grid is even on the table")
 

@@ -7,17 +7,21 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from marl_handover.config import (
+    EPSILON_DEG,
     HINDSIGHT,
     CellConfig,
     CentralisedConfig,
     DecentralisedConfig,
     TaskConfig,
+    bounded,
     changed,
+    check_bounds,
+    chosen,
+    path_field,
     require_at_least,
-    require_between,
     require_choice,
-    require_positive,
-    require_seed,
+    seed_field,
+    sized,
 )
 from marl_handover.errors import InvalidSetting
 from marl_handover.learning.algorithm_settings import ALGORITHMS, AlgorithmConfig, OffPolicyConfig, SacConfig
@@ -30,18 +34,18 @@ class HindsightConfig:
     But for goals from later in an episode where noise is not the task's own (physics), or arms take turns: these know where it went.
     """
 
-    strategy: str = "future"  # none, final, future or episode: which later poses of the episode become goals
-    ratio: float = 0.5  # share of transitions that get a hindsight goal
-    near_miss_ratio: float = 0.25  # share of the hindsight goals that are turned, to show where success ends
-    near_miss_epsilons: float = 1.5  # by up to so many epsilons either way
-    random_ratio: float = 0.15  # share that get another transition's goal; true because a hand-over does not depend on the goal
+    strategy: str = chosen("future", HINDSIGHT)  # none, final, future or episode: which later poses of the episode become goals
+    ratio: float = bounded(0.5, 0.0, 1.0)  # share of transitions that get a hindsight goal
+    near_miss_ratio: float = bounded(0.25, 0.0, 1.0)  # share of the hindsight goals that are turned, to show where success ends
+    near_miss_epsilons: float = bounded(1.5, 0.0, 1000.0)  # by up to so many epsilons either way
+    random_ratio: float = bounded(0.15, 0.0, 1.0)  # share that get another transition's goal; true: a hand-over does not depend on the goal
 
 
 @dataclass
 class ReplayConfig:
     """Replay memory."""
 
-    capacity: int = 100_000
+    capacity: int = bounded(100_000, 1, 10**7)
     hindsight: HindsightConfig = field(default_factory=HindsightConfig)
     symmetry: bool = False  # mirror sampled transitions by a random element of the group of four
     correct_terminated: bool = True  # False keeps the stored end flag when relabelling, as Stable-Baselines3 does
@@ -51,10 +55,10 @@ class ReplayConfig:
 class StageConfig:
     """One stage of the curriculum: each episode's epsilon is drawn log-uniformly from [low, high]."""
 
-    epsilon_low_deg: float = 5.0
-    epsilon_high_deg: float = 5.0
-    until_step: int = 0  # environment step that ends the stage; 0 = the end of training
-    until_success: float = 1.0  # a success rate in evaluation that ends it earlier; 1 = never
+    epsilon_low_deg: float = bounded(5.0, *EPSILON_DEG)
+    epsilon_high_deg: float = bounded(5.0, *EPSILON_DEG)
+    until_step: int = bounded(0, 0, 10**9)  # environment step that ends the stage; 0 = the end of training
+    until_success: float = bounded(1.0, 0.0, 1.0)  # a success rate in evaluation that ends it earlier; 1 = never
 
 
 VARIANTS: dict[str, Collection[str]] = {"hierarchical": ALGORITHMS, "centralised": ("sac", "box_sac"), "decentralised": ("sac",)}
@@ -74,32 +78,31 @@ class TrainConfig:
     task: TaskConfig = field(default_factory=TaskConfig)
     algorithm: AlgorithmConfig = field(default_factory=SacConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
-    curriculum: list[StageConfig] = field(default_factory=lambda: [StageConfig(0.7, 12.0)])
-    variant: str = "hierarchical"  # hierarchical, centralised or decentralised
+    curriculum: list[StageConfig] = sized(lambda: [StageConfig(0.7, 12.0)], 1, 100)
+    variant: str = chosen("hierarchical", tuple(VARIANTS))  # hierarchical, centralised or decentralised
     centralised: CentralisedConfig = field(default_factory=CentralisedConfig)
     decentralised: DecentralisedConfig = field(default_factory=DecentralisedConfig)
-    source: str = "batched"  # of transitions: batched (the rule book itself), or aec (the PettingZoo environment, executors and all)
-    backend: str = "kinematic"  # of source=aec: kinematic, noisy or bullet
-    executor: str = (
-        "direct"  # of source=aec: how arms move: direct (straight in joint space, through anything), or optimised (collision-free)
-    )
-    collector: str = "local"  # of source=aec: local, multiprocess or ray
-    workers: int = 2  # of collector=multiprocess and ray
-    steps: int = 48_000  # commanded transfers, over all cells
-    num_envs: int = 64
-    seed: int = 0
+    source: str = chosen("batched", SOURCES)  # of transitions: batched (the rule book itself), or aec (the PettingZoo environment)
+    backend: str = chosen("kinematic", BACKENDS)  # of source=aec: kinematic, noisy or bullet
+    executor: str = chosen("direct", EXECUTORS)  # of source=aec: direct (straight in joint space), or optimised (collision-free)
+    collector: str = chosen("local", COLLECTORS)  # of source=aec: local, multiprocess or ray
+    workers: int = bounded(2, 1, 256)  # of collector=multiprocess and ray
+    steps: int = bounded(48_000, 1, 10**9)  # commanded transfers, over all cells
+    num_envs: int = bounded(64, 1, 65_536)
+    seed: int = seed_field()
     device: str = "cpu"  # cpu, cuda, cuda:N
-    threads: int = 1  # of torch on the CPU; networks this small gain nothing from more
-    compile: str = "auto"  # auto, on, off: torch.compile of the losses
-    out: str = ""  # run directory; runs/<date>-<time> if empty
-    resume: str = ""  # run directory to continue
-    evaluation_interval: int = 4_000  # environment steps
-    evaluation_episodes: int = 2_000
-    checkpoint_interval: int = 8_000  # environment steps
+    threads: int = bounded(1, 1, 256)  # of torch on the CPU; networks this small gain nothing from more
+    compile: str = chosen("auto", ("auto", "on", "off"))  # auto, on, off: torch.compile of the losses
+    out: str = path_field()  # run directory; runs/<date>-<time> if empty
+    resume: str = path_field()  # run directory to continue
+    evaluation_interval: int = bounded(4_000, 1, 10**9)  # environment steps
+    evaluation_episodes: int = bounded(2_000, 1, 10**6)
+    checkpoint_interval: int = bounded(8_000, 1, 10**9)  # environment steps
     progress: bool = True
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
+        check_bounds(self)
         if self.task.layout not in (TaskConfig().layout, self.algorithm.layout):
             raise InvalidSetting("task.layout", self.task.layout, "left alone in training; the learner's layout is algorithm.layout")
         self.task.layout = self.algorithm.layout
@@ -107,26 +110,10 @@ class TrainConfig:
             raise InvalidSetting("task.previous_arm", self.task.previous_arm, "left alone in training; use algorithm.previous_arm")
         self.task.previous_arm = self.algorithm.previous_arm
         self.task.validate()
-        require_choice("variant", self.variant, tuple(VARIANTS))
         require_choice(f"algorithm of variant={self.variant}", self.algorithm.name, tuple(VARIANTS[self.variant]))
-        require_choice("source", self.source, SOURCES)
-        require_choice("backend", self.backend, BACKENDS)
-        require_choice("executor", self.executor, EXECUTORS)
-        require_choice("collector", self.collector, COLLECTORS)
-        require_choice("compile", self.compile, ("auto", "on", "off"))
-        require_choice("replay.hindsight.strategy", self.replay.hindsight.strategy, HINDSIGHT)
-        require_between("replay.hindsight.ratio", self.replay.hindsight.ratio, 0, 1)
-        require_between("replay.hindsight.near_miss_ratio", self.replay.hindsight.near_miss_ratio, 0, 1)
-        require_at_least("replay.hindsight.near_miss_epsilons", self.replay.hindsight.near_miss_epsilons, 0)
-        require_between("replay.hindsight.random_ratio", self.replay.hindsight.random_ratio, 0, 1)
-        for name in ("steps", "num_envs", "workers", "threads", "evaluation_interval", "evaluation_episodes", "checkpoint_interval"):
-            require_at_least(name, getattr(self, name), 1)
         require_at_least("replay.capacity", self.replay.capacity, self.task.max_steps * self.num_envs)
-        require_at_least("curriculum (number of stages)", len(self.curriculum), 1)
         for index, stage in enumerate(self.curriculum):
-            require_positive(f"curriculum[{index}].epsilon_low_deg", stage.epsilon_low_deg)
             require_at_least(f"curriculum[{index}].epsilon_high_deg", stage.epsilon_high_deg, stage.epsilon_low_deg)
-        require_seed(self.seed)
         self.algorithm.validate()
         if self.algorithm.name == "sac" and self.algorithm.layout != "relative":
             raise InvalidSetting("algorithm.layout", self.algorithm.layout, "'relative' for algorithm=sac; box_sac takes any layout")

@@ -18,10 +18,12 @@ from marl_handover.config import (
     LoopConfig,
     MotionConfig,
     TaskChanges,
+    bounded,
     changed,
-    require_at_least,
-    require_choice,
-    require_seed,
+    check_bounds,
+    chosen,
+    path_field,
+    seed_field,
 )
 from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.settings import HardwareConfig
@@ -42,25 +44,23 @@ BACKENDS = ("kinematic", "noisy", "bullet", "twin")
 class AssessmentConfig:
     """Who is judged, where, on which problems. What is not given is the policy's own, or the default."""
 
-    policy: str = "exact"  # exact, random, greedy, pretrained_a, pretrained_b, pretrained_twin, a run directory or a policy file
-    backend: str = "kinematic"  # where transfers are executed: kinematic, or in closed loop with planned motions noisy, bullet or twin
-    episodes: int = 1000  # random problems
-    seed: int = 0  # of the problems, and of execution noise but for the twin, whose servos go on as they are
+    policy: str = path_field("exact")  # exact, random, greedy, pretrained_a or _b or _twin, a run directory or a policy file
+    backend: str = chosen("kinematic", BACKENDS)  # kinematic; in closed loop with planned motions: noisy, bullet or twin
+    episodes: int = bounded(1000, 1, 10**6)  # random problems
+    seed: int = seed_field()  # of the problems, and of execution noise but for the twin, whose servos go on as they are
     cell: CellConfig | None = None  # single keys change the paper cell
     task: TaskChanges = field(default_factory=TaskChanges)  # task.noise left out: of noisy, 1 mm and 0.5 deg
-    grasp: str | None = None  # of bullet: friction or constraint; null: friction
-    missed_grasps: float | None = None  # of noisy: probability that the fingers close on nothing; null: 0.01
+    grasp: str | None = chosen(None, ("friction", "constraint"))  # of bullet: friction or constraint; null: friction
+    missed_grasps: float | None = bounded(None, 0.0, 1.0)  # of noisy: probability that the fingers close on nothing; null: 0.01
     loop: LoopConfig = field(default_factory=LoopConfig)  # of all but kinematic
     motion: MotionConfig = field(default_factory=MotionConfig)  # of all but kinematic
-    calibration: str | None = None  # of twin: folder of its calibration; null: runs/calibration/twin
+    calibration: str | None = path_field(None)  # of twin: folder of its calibration; null: runs/calibration/twin
     hardware: HardwareConfig | None = None  # of twin: single keys change its electronics; ports are always the emulated ones
-    problems: str = ""  # JSON Lines of problems instead of random ones
+    problems: str = path_field()  # JSON Lines of problems instead of random ones
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on what can be refused without playing."""
-        require_choice("backend", self.backend, BACKENDS)
-        require_at_least("episodes", self.episodes, 1)
-        require_seed(self.seed)
+        check_bounds(self)
         backend_options(self)
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from marl_handover.compose import from_yaml
-from marl_handover.config import require_at_least, require_between, require_positive
+from marl_handover.config import bounded, check_bounds, path_field, require_between, seed_field
 from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.perception.settings import (
@@ -34,61 +33,55 @@ _RENDERED = ("width_px", "height_px", "max_age_s")
 class WatchConfig:
     """When a sighting is taken for where the block lies, and how long anything is waited for."""
 
-    frame_s: float = 1 / 30  # between two looks
-    picture_s: float = 0.5  # no new picture for this long: the camera gives none
-    steady_frames: int = 4  # sightings in a row that agree; so many that a frozen camera has shown itself by then
-    steady_mm: float = 0.6
-    steady_deg: float = 0.8
-    hidden_s: float = 1.0  # arms parked and no steady sighting for this long: something is wrong, and said
-    glance_s: float = 0.25  # between two glances at the block while a hand comes near
-    patience_s: float = 15.0  # how long a camera, a block or a person is waited for
-    moved_mm: float = 4.0  # nearer than this, or ...
-    moved_deg: float = 5.0  # ... turned by less, the block has not been moved
-    missed_mm: float = 12.0  # a block this far from where it was to be put down was lost on the way
-    failures: int = 3  # transfers of one arm in a row that did not move the block: the arm is stalled
+    frame_s: float = bounded(1 / 30, 1e-3, 10.0)  # between two looks
+    picture_s: float = bounded(0.5, 0.01, 600.0)  # no new picture for this long: the camera gives none
+    steady_frames: int = bounded(4, 1, 100)  # sightings in a row that agree; so many that a frozen camera has shown itself by then
+    steady_mm: float = bounded(0.6, 1e-3, 1000.0)
+    steady_deg: float = bounded(0.8, 1e-3, 360.0)
+    hidden_s: float = bounded(1.0, 0.001, 600.0)  # arms parked and no steady sighting for this long: something is wrong, and said
+    glance_s: float = bounded(0.25, 1e-3, 60.0)  # between two glances at the block while a hand comes near
+    patience_s: float = bounded(15.0, 0.001, 3600.0)  # how long a camera, a block or a person is waited for
+    moved_mm: float = bounded(4.0, 1e-3, 1000.0)  # nearer than this, or ...
+    moved_deg: float = bounded(5.0, 1e-3, 360.0)  # ... turned by less, the block has not been moved
+    missed_mm: float = bounded(12.0, 1e-3, 1000.0)  # a block this far from where it was to be put down was lost on the way
+    failures: int = bounded(3, 1, 1000)  # transfers of one arm in a row that did not move the block: the arm is stalled
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` on a value out of its limits."""
-        for name in ("frame_s", "picture_s", "steady_mm", "steady_deg", "hidden_s", "glance_s", "moved_mm", "moved_deg", "missed_mm"):
-            require_positive(f"watch.{name}", getattr(self, name))
-        require_between("watch.steady_frames", self.steady_frames, 1, 100)
+        check_bounds(self, "watch.")
         require_between("watch.patience_s", self.patience_s, self.hidden_s, 3600)
-        require_at_least("watch.failures", self.failures, 1)
 
 
 @dataclass
 class TwinConfig:
     """What the twin's people and glue are like, beside its servos (``hardware.emulator``) and its camera (``mount``, ``look``)."""
 
-    seed: int = 0  # of the camera's noise and of what people do
-    card_sd_mm: float = 0.3  # how exactly the marker cards are glued onto the hands
-    card_sd_deg: float = 0.5
-    board_sd_mm: float = 0.3  # how exactly the calibration board is laid onto its marks
-    board_sd_deg: float = 0.1
+    seed: int = seed_field()  # of the camera's noise and of what people do
+    card_sd_mm: float = bounded(0.3, 0.0, 20.0)  # how exactly the marker cards are glued onto the hands
+    card_sd_deg: float = bounded(0.5, 0.0, 45.0)
+    board_sd_mm: float = bounded(0.3, 0.0, 20.0)  # how exactly the calibration board is laid onto its marks
+    board_sd_deg: float = bounded(0.1, 0.0, 45.0)
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` on a value out of its limits."""
-        for name in ("card_sd_mm", "card_sd_deg", "board_sd_mm", "board_sd_deg"):
-            require_at_least(f"twin.{name}", getattr(self, name), 0)
+        check_bounds(self, "twin.")
 
 
 @dataclass
 class CardConfig:
     """The printed markers that are glued onto the hands while servos are calibrated: which, how large, and where in the grip's frame."""
 
-    ids: list[int] = field(default_factory=lambda: [2, 3])  # left arm's, right arm's; of target.dictionary
-    marker_mm: float = 30.0
-    place_mm: list[float] = field(default_factory=lambda: [-47.0, 0.0, 13.2])  # its middle: flat on the hand, x along the fingers
+    ids: list[int] = bounded([2, 3], 0, 10_000, (1, 32))  # left arm's, right arm's; of target.dictionary
+    marker_mm: float = bounded(30.0, 4.0, 200.0)
+    place_mm: list[float] = bounded([-47.0, 0.0, 13.2], -500.0, 500.0, (3, 3))  # its middle: flat on the hand, x along the fingers
 
     def validate(self, target: TargetConfig) -> None:
         """Raise :class:`InvalidSetting` on a value out of its limits, or a marker that means something else in ``target``."""
+        check_bounds(self, "cards.")
         count, taken = MARKERS[target.dictionary], {target.block_id, target.goal_id}
         if len(self.ids) != len(ARMS) or len({*self.ids} - taken) != len(ARMS) or not all(0 <= number < count for number in self.ids):
             wanted = f"two different numbers from 0 to {count - 1} that are neither target.block_id nor target.goal_id"
             raise InvalidSetting("cards.ids", self.ids, wanted)
-        require_positive("cards.marker_mm", self.marker_mm)
-        if len(self.place_mm) != 3 or not all(math.isfinite(value) for value in self.place_mm):
-            raise InvalidSetting("cards.place_mm", self.place_mm, "three finite numbers")
 
 
 @dataclass
@@ -97,8 +90,8 @@ class LabConfig:
 
     hardware: HardwareConfig = field(default_factory=HardwareConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
-    calibration: str = ""  # folder of what calibrate writes; empty: runs/calibration/<name of the hardware>
-    chart_inset: float = 0.99  # hand-overs keep to this part of the chart; 0.95 with a policy that was trained with it
+    calibration: str = path_field()  # folder of what calibrate writes; empty: runs/calibration/<name of the hardware>
+    chart_inset: float = bounded(0.99, 0.1, 1.0)  # hand-overs keep to this part of the chart; 0.95 with a policy that was trained with it
     board: BoardConfig = field(default_factory=BoardConfig)
     target: TargetConfig = field(default_factory=TargetConfig)
     detector: DetectorConfig = field(default_factory=DetectorConfig)
@@ -120,10 +113,10 @@ class LabConfig:
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits, or one that this cell does not use."""
+        check_bounds(self)
         for part in (self.hardware, self.board, self.target, self.detector, self.tracker, self.watch, self.mount, self.look, self.twin):
             part.validate()
         self.cards.validate(self.target)
-        require_between("chart_inset", self.chart_inset, 0.1, 1)
         if self.watch.steady_frames < self.tracker.frozen_frames:
             raise InvalidSetting(
                 "watch.steady_frames", self.watch.steady_frames, f"at least tracker.frozen_frames = {self.tracker.frozen_frames}"

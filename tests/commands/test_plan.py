@@ -91,13 +91,14 @@ def test_a_policy_that_fails_says_how_and_still_writes(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["start=[1,2]"], "start = [1.0, 2.0]: must be three numbers"),
-        (["goal=[]"], "goal = []: must be three numbers"),
-        (["start=[nan,0,0]"], "start = [nan, 0.0, 0.0]: every number must be finite"),
+        (["start=[1,2]"], "start = [1.0, 2.0]: must be 3 numbers: x [mm], y [mm], orientation [deg]; this has 2"),
+        (["goal=[]"], "goal = []: must be 3 numbers"),
+        (["start=[nan,0,0]"], "start[0] = nan: every number must be finite"),
         (["goal=[0,0,-inf]"], "every number must be finite"),
         (["start=[a,0,0]"], "cannot read 'start=[a,0,0]'"),
         (["goal=[0,180,0]"], "goal (0, 180) mm is out of every arm's reach; it must lie 150 to 230 mm"),
-        (["start=[1e200,0,0]"], "out of every arm's reach"),
+        (["start=[1e5,0,0]"], "out of every arm's reach"),
+        (["start=[1e200,0,0]"], "start[0] = 1e+200: must be between -1e+06 and 1e+06"),
         (["policy=exakt"], "policy = 'exakt' is not known"),
         (["policy=no/such/run"], "not found: no/such/run"),
         (["architecture=C"], "choose one of: A, B"),

@@ -100,7 +100,7 @@ def test_a_run_is_not_overwritten(finished, capsys):
         ("architecture=C", ("A, B",)),
         ("variant=flat", ("hierarchical",)),
         ("device=gpu9", ("device", "cpu")),
-        ("steps=0", ("steps", "at least 1")),
+        ("steps=0", ("steps", "between 1 and 1000000000")),
         ("num_envs=-4", ("num_envs",)),
         ("threads=0", ("threads",)),
         ("compile=maybe", ("auto, on, off",)),

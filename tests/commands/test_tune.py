@@ -152,7 +152,7 @@ def test_a_folder_holds_one_study(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("argument", "words"),
     [
-        ("trials=0", ("trials", "at least 1")),
+        ("trials=0", ("trials", "between 1 and 100000")),
         ("jobs=-1", ("jobs",)),
         ("pruner=hope", ("median, hyperband, none",)),
         ("launcher=slurm", ("loky, ray",)),

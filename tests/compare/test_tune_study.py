@@ -95,7 +95,7 @@ def test_only_what_is_named_is_changed():
         ("algorithm.gama: {type: float, low: 0.9, high: 0.99}", ("algorithm.gama", "gamma")),
         ("nowhere.gamma: {type: float, low: 0.9, high: 0.99}", ("nowhere",)),
         ("seed.gamma: {type: float, low: 0.9, high: 0.99}", ("seed.gamma", "no settings below")),
-        ("algorithm.gamma: {type: float, low: 0.9, high: 1.5}", ("algorithm.gamma = 1.5", "between 0 and 1")),
+        ("algorithm.gamma: {type: float, low: 0.9, high: 1.5}", ("algorithm.gamma = 1.5", "between 0.001 and 1")),
         ("algorithm.gamma: {type: float, low: 0.99, high: 0.9}", ("algorithm.gamma", "low <= high")),
         ("algorithm.gamma: {type: float, low: 0.0, high: 0.9, log: true}", ("algorithm.gamma", "low > 0")),
         ("algorithm.gamma: {type: float, low: .nan, high: 0.9}", ("algorithm.gamma", "finite")),
