@@ -21,6 +21,8 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from marl_handover.motion.trajectory import LOADED_PHASES
+
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import numpy as np
 from common import ROOT, commit, machine, parse, table
@@ -32,7 +34,7 @@ from marl_handover.runtime.interactive.cell import InteractiveCell, Snapshot
 DEFAULTS = {"changes": 300, "policies": "exact,pretrained_b", "drags": 10, "speed": 4.0, "seed": 0, "results": "bench/results"}
 LIMIT_MS = 100.0
 RATE_HZ, DRAG_HZ = 50.0, 30.0
-EMPTY, HELD = ("approach", "grasp", "release", "retreat"), ("lift", "transfer", "lower")
+EMPTY, HELD = ("approach", "grasp", "release", "retreat"), LOADED_PHASES
 
 
 class Page:

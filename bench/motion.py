@@ -30,11 +30,11 @@ from marl_handover.cell.build import build_cell, cell_config
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.commands.plan import solve
 from marl_handover.learning.evaluation import random_problems
-from marl_handover.motion.certify import certify
-from marl_handover.motion.cost import cost_table
-from marl_handover.motion.overlap import overlapped
+from marl_handover.motion.continuous_collision import certify
+from marl_handover.motion.coordination import coordinate
+from marl_handover.motion.path_length_table import path_length_table
+from marl_handover.motion.path_optimizer import FoundPath, NoPath
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.segment import FoundPath, NoPath
 from marl_handover.policies import load
 from marl_handover.runtime.motions import plan_motions
 
@@ -46,10 +46,10 @@ from marl_handover.cell.build import build_cell, cell_config
 from marl_handover.motion.planner import MotionPlanner
 planner = MotionPlanner(build_cell(cell_config("paper")))
 began = time.perf_counter()
-planner.transfer(1, np.array([-110.0, -50.0]), np.array([90.0, -10.0]), planner.parked_rad)
+planner.transfer(1, np.array([-110.0, -50.0]), np.array([90.0, -10.0]), planner.home_rad)
 first = time.perf_counter() - began
 began = time.perf_counter()
-planner.cycle(1, [-110.0, -50.0], [90.0, -10.0], planner.parked_rad, planner.parked_rad)
+planner.pick_place(1, [-110.0, -50.0], [90.0, -10.0], planner.home_rad, planner.home_rad)
 print(first, time.perf_counter() - began)
 """
 
@@ -105,7 +105,7 @@ def overlaps(planner: MotionPlanner, count: int) -> dict[str, Any]:
     for start, goal in zip(*random_problems(policy.rules, count, 0), strict=True):
         way = solve(policy, start, goal)["transfers"]
         orders = [(ARM_LETTERS.index(step["arm"]), np.array(step["from"][:2]), np.array(step["to"][:2])) for step in way]
-        saved.append(overlapped(planner, plan_motions(planner, orders)))
+        saved.append(coordinate(planner, plan_motions(planner, orders)))
     whole = sum(it.sequential_s for it in saved)
     return {"sequences": count, "sequential_s": round(whole, 1), "saved": round(1 - sum(it.overlapped_s for it in saved) / whole, 4)}
 
@@ -125,9 +125,9 @@ def random_places(planner: MotionPlanner, count: int, seed: int) -> list[tuple[i
 
 def cycles(planner: MotionPlanner, count: int, seed: int) -> dict[str, Any]:
     """All seven phases, planned, checked and timed, from parked to parked, the other arm parked."""
-    parked = planner.parked_rad
+    parked = planner.home_rad
     planner.warm_up()
-    results = [timed(lambda it=it: planner.cycle(*it, parked, parked)) for it in random_places(planner, count, seed)]
+    results = [timed(lambda it=it: planner.pick_place(*it, parked, parked)) for it in random_places(planner, count, seed)]
     refused = Counter(f"{it.found.reason}: {it.found.what}" for it in results if isinstance(it.found, NoPath))
     times = {"ms": spread([it.ms for it in results], 2), "cpu_ms": spread([it.cpu_ms for it in results], 2)}
     return {"cycles": count, **times, "refused": dict(refused)}
@@ -149,10 +149,10 @@ def first_plans() -> dict[str, Any]:
 
 def path_costs(planner: MotionPlanner, count: int, seed: int) -> dict[str, Any]:
     """The interpolated path cost against the planner, and its speed."""
-    cell, costs = planner.model.cell, cost_table(planner.model.cell, planner.motion)
+    cell, costs = planner.model.cell, path_length_table(planner.model.cell, planner.motion)
     places, lengths = random_places(planner, count, seed), []
     for it in tqdm(places, desc="path costs", leave=False):
-        result = timed(lambda it=it: planner.transfer(*it, planner.parked_rad)).found
+        result = timed(lambda it=it: planner.transfer(*it, planner.home_rad)).found
         lengths.append(result.length_mm if isinstance(result, FoundPath) else np.nan)
     arm, start, end = (np.array(column) for column in zip(*places, strict=True))
     known = np.isfinite(lengths)

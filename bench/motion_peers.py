@@ -12,12 +12,12 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.motion.paper_method import plan_paper
+from marl_handover.motion.ompl_planner import STEP_RAD, OmplMissing, rrt_connect
+from marl_handover.motion.path_optimizer import FoundPath, NoPath, Segment
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.segment import FoundPath, NoPath, Segment
+from marl_handover.motion.slsqp_planner import plan_slsqp
 from marl_handover.motion.splines import knots
-from marl_handover.motion.timing import time_path
-from marl_handover.motion.witness import STEP_RAD, OmplMissing, rrt_connect
+from marl_handover.motion.time_parametrization import time_path
 
 TOLERANCE_MM, OMPL_S, REPEATS = 1.0, 5.0, 3
 
@@ -54,11 +54,11 @@ def arguments(row: dict[str, Any]) -> tuple[int, np.ndarray, np.ndarray, np.ndar
 def against_paper(planner: MotionPlanner, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The paper's program and our planner on the same rows, one after the other."""
     ours, theirs = [], []
-    plan_paper(planner.carrying(*arguments(rows[0]))[0], maxiter=2, tolerance_mm=math.inf)
+    plan_slsqp(planner.carrying(*arguments(rows[0]))[0], maxiter=2, tolerance_mm=math.inf)
     for row in rows:
         ours.append(timed(lambda row=row: planner.transfer(*arguments(row))))
         segment = planner.carrying(*arguments(row))[0]
-        theirs.append(timed(lambda segment=segment: plan_paper(segment, tolerance_mm=TOLERANCE_MM)))
+        theirs.append(timed(lambda segment=segment: plan_slsqp(segment, tolerance_mm=TOLERANCE_MM)))
     shortfalls = [max(0.0, -it.found.margins.worst) for it in theirs if isinstance(it.found, FoundPath)]
     both = [
         (a.found, b.found) for a, b in zip(theirs, ours, strict=True) if isinstance(a.found, FoundPath) and isinstance(b.found, FoundPath)
@@ -102,7 +102,7 @@ def against_ompl(planner: MotionPlanner, rows: Sequence[dict[str, Any]]) -> dict
 
 def ompl_way(segment: Segment, seed: int) -> np.ndarray | None:
     """Corners (k, 4) of a way that keeps all demands."""
-    low, high = segment.body.limits.T
+    low, high = segment.collision_model.limits.T
     return rrt_connect(*segment.ends, lambda q: segment.check(q[None])[0].worst >= 0.0, low, high, seconds=OMPL_S, seed=seed)
 
 

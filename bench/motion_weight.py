@@ -24,9 +24,9 @@ from marl_handover.cell.build import build_cell, cell_config
 from marl_handover.cell.cell import REACH_TOLERANCE_MM
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.learning.rollout import Decision, play
-from marl_handover.motion.cost import cost_table
+from marl_handover.motion.path_length_table import path_length_table
+from marl_handover.motion.path_optimizer import NoPath
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.segment import NoPath
 from marl_handover.policies import SupervisorPolicy, load
 from marl_handover.task.rules import Outcome
 
@@ -52,7 +52,7 @@ def trained(weight: str, values: dict[str, Any]) -> Path:
 
 def judged(policy: SupervisorPolicy, planner: MotionPlanner, episodes: int) -> dict[str, Any]:
     """Steps and lengths of a policy on the problems of evaluation seed 100."""
-    costs, steps = cost_table(planner.model.cell, planner.motion), []
+    costs, steps = path_length_table(planner.model.cell, planner.motion), []
     result = play(policy.rules, policy.act, *random_problems(policy.rules, episodes, EVALUATION_SEED), observer=steps.append)
     ways = [moved(decision) for decision in steps]
     episode, arm, start, end = (np.concatenate(column) for column in zip(*ways, strict=True))
@@ -89,7 +89,7 @@ def planned_mm(planner: MotionPlanner, arm: np.ndarray, start: np.ndarray, end: 
     lengths = np.full(len(arm), np.nan)
     for row in tqdm(range(len(arm)), desc="planned", leave=False):
         try:
-            lengths[row] = planner.transfer(int(arm[row]), start[row], end[row], planner.parked_rad).length_mm
+            lengths[row] = planner.transfer(int(arm[row]), start[row], end[row], planner.home_rad).length_mm
         except NoPath:
             continue
     return lengths, int(np.isnan(lengths).sum())

@@ -28,15 +28,15 @@ from common import parse
 from tqdm import tqdm
 
 from marl_handover.cell.build import build_cell, cell_config
-from marl_handover.motion.descent import Effort
+from marl_handover.motion.augmented_lagrangian import SolverOptions
+from marl_handover.motion.initial_guesses import carrying_guesses, fit_control_points, random_bend
+from marl_handover.motion.path_optimizer import NoPath, require_free_ends, solve_from
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.segment import NoPath, attempt, refuse_bad_ends
 from marl_handover.motion.splines import evaluate
-from marl_handover.motion.starts import bent, carrying_starts, fitted
 
 FILE = Path(__file__).parent / "data" / "transfers.jsonl"
 COUNT, SEED, GRASPING, LIFTED_MM = 1000, 7, 0.6, (60.0, 88.0)
-THOROUGH = Effort(penalty=0.3, growth=4.0, rounds=8, steps=80, gain=1e-6, slack_mm=0.2)
+THOROUGH = SolverOptions(penalty=0.3, growth=4.0, rounds=8, steps=80, gain=1e-6, slack_mm=0.2)
 
 
 def main(arguments: list[str]) -> None:
@@ -75,13 +75,15 @@ def problems(planner: MotionPlanner, count: int, seed: int) -> Iterator[dict[str
             continue
         try:
             segment, _ = planner.carrying(arm, pick, place, other)
-            refuse_bad_ends(segment)
+            require_free_ends(segment)
         except NoPath:
             continue
-        plain = list(carrying_starts(segment.body, segment.ends, segment.scene.profile[:4].reshape(2, 2), segment.scene.pick_height, 40.0))[
-            1
-        ]
-        points = fitted(plain, segment.body.limits, 9, 5)
+        plain = list(
+            carrying_guesses(
+                segment.collision_model, segment.ends, segment.scene.profile[:4].reshape(2, 2), segment.scene.pick_height, 40.0
+            )
+        )[1]
+        points = fit_control_points(plain, segment.collision_model.limits, 9, 5)
         margins, _ = segment.check(evaluate(points, np.linspace(0, 1, 201), 5))
         blocked = margins.arm < 0.0
         if left[blocked]:
@@ -116,12 +118,12 @@ def improve(planner: MotionPlanner, path: Path) -> None:
         ends = segment.scene.profile[:4].reshape(2, 2)
         for count in (9, 11, 13, 15):
             guesses = [
-                fitted(guess, segment.body.limits, count, 5)
-                for guess in carrying_starts(segment.body, segment.ends, ends, segment.scene.pick_height, 40.0)
+                fit_control_points(guess, segment.collision_model.limits, count, 5)
+                for guess in carrying_guesses(segment.collision_model, segment.ends, ends, segment.scene.pick_height, 40.0)
             ]
-            bends = [bent(guess, segment.body.limits, 5, 1000 * count + k) for k, guess in enumerate(guesses)]
+            bends = [random_bend(guess, segment.collision_model.limits, 5, 1000 * count + k) for k, guess in enumerate(guesses)]
             for points in guesses + bends:
-                found, _, _ = attempt(segment, points, 5, THOROUGH)
+                found, _, _ = solve_from(segment, points, 5, THOROUGH)
                 if found is not None and (row["best_mm"] is None or found.length_mm < row["best_mm"]):
                     row["best_mm"] = found.length_mm
         if number % 50 == 49:
@@ -131,7 +133,7 @@ def improve(planner: MotionPlanner, path: Path) -> None:
 
 def settle(planner: MotionPlanner, path: Path) -> None:
     """Replace the problems without a known way by others of their kind."""
-    from marl_handover.motion.witness import rrt_connect
+    from marl_handover.motion.ompl_planner import rrt_connect
 
     rows, out = read(path), []
     spare = iter(list(problems(planner, 200, SEED + 1)))
@@ -144,7 +146,7 @@ def settle(planner: MotionPlanner, path: Path) -> None:
         def free(q: Any, segment: Any = segment) -> bool:
             return bool(segment.check(q[None])[0].worst >= 0.0)
 
-        limits = planner.body.limits
+        limits = planner.collision_model.limits
         if rrt_connect(segment.ends[0], segment.ends[1], free, limits[:, 0], limits[:, 1], seconds=15, seed=SEED) is None:
             out.append(row)
             rows[index] = next(other for other in spare if other["blocked"] == row["blocked"])

@@ -111,7 +111,7 @@ def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> N
     Raises:
         NoMotion: if one of them has no collision-free motion; then nothing is written.
     """
-    from marl_handover.motion.overlap import overlapped
+    from marl_handover.motion.coordination import coordinate
     from marl_handover.report.files import save_figure, write_json
     from marl_handover.runtime.motions import motion_row, plan_motions
 
@@ -124,7 +124,7 @@ def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> N
             f"motion {number}: arm {ARM_LETTERS[motion.arm]}, {motion.duration_s:.2f} s, grip path {motion.path_length_mm:.1f} mm, "
             f"clearance to the other arm {motion.min_clearance_mm:.1f} mm, planned in {motion.planning_ms:.1f} ms"
         )
-    schedule = overlapped(planner, motions)
+    schedule = coordinate(planner, motions)
     if len(motions) > 1:
         print(
             f"one after another {schedule.sequential_s:.2f} s; with the next arm setting out as early as the clearance allows "

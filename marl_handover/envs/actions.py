@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.geometry.arm_model import ArmModel
-from marl_handover.motion.trajectory import CyclePaths
+from marl_handover.motion.trajectory import PickPlacePaths
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def read_command(action: Any, num_arms: int) -> Floats | Refusal:
     return np.array([2.0 * final - 1.0, 2.0 * arm - 1.0, *place])
 
 
-def read_cycle(action: Any, control_points: int, arm: ArmModel) -> CyclePaths | Refusal:
+def read_cycle(action: Any, control_points: int, arm: ArmModel) -> PickPlacePaths | Refusal:
     """An arm's action as paths, or why it is none."""
     grasp, release = _choice(action, "grasp", 2), _choice(action, "release", 2)
     for value in (grasp, release):
@@ -46,7 +46,7 @@ def read_cycle(action: Any, control_points: int, arm: ArmModel) -> CyclePaths | 
     if isinstance(paths, Refusal):
         return paths
     inside = np.clip(paths, arm.lower_rad, arm.upper_rad)
-    return CyclePaths(*np.where(abs(paths - inside) <= SNAP_RAD, inside, paths))
+    return PickPlacePaths(*np.where(abs(paths - inside) <= SNAP_RAD, inside, paths))
 
 
 def _choice(action: Any, key: str, count: int) -> int | Refusal:

@@ -19,7 +19,7 @@ from marl_handover.config import MotionConfig, NoiseConfig, TaskConfig, require_
 from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
 from marl_handover.envs.top_view import TopView
 from marl_handover.errors import InvalidSetting
-from marl_handover.motion.trajectory import CyclePaths
+from marl_handover.motion.trajectory import PickPlacePaths
 from marl_handover.task.rules import carried
 
 __all__ = ["BACKENDS", "Backend", "Correctable", "Execution", "KinematicBackend", "NoisyBackend", "Refusal", "make_backend"]
@@ -35,12 +35,14 @@ class Execution(NamedTuple):
         joints_rad: (num_arms, 5) afterwards.
         path_mm: length of the grip's path between grasp and release.
         refusal: why it was refused or failed, a value of :class:`Refusal`; None if neither.
+        duration_s: of the motion that was carried out; None from a backend that does not time motions, or did not come so far.
     """
 
     pose: Floats
     joints_rad: Floats
     path_mm: float
     refusal: str | None
+    duration_s: float | None = None
 
 
 class Backend(Protocol):
@@ -55,7 +57,7 @@ class Backend(Protocol):
     def joints_rad(self) -> Floats:
         """Joints of all arms now (num_arms, 5)."""
 
-    def execute(self, arm: int, paths: CyclePaths) -> Execution:
+    def execute(self, arm: int, paths: PickPlacePaths) -> Execution:
         """Carry out one cycle of ``arm``; the others hold still."""
 
     def render(self) -> NDArray[np.uint8]:
@@ -73,7 +75,7 @@ class Correctable(Protocol):
         """Put the object at ``pose`` (3,)."""
 
 
-CollisionCheck = Callable[[int, CyclePaths, Floats], bool]
+CollisionCheck = Callable[[int, PickPlacePaths, Floats], bool]
 """Whether a cycle of an arm touches anything, the joints of all arms being (num_arms, 5) before it."""
 
 
@@ -93,13 +95,13 @@ class KinematicBackend:
         self.model, self.motion = model, motion
         self.check = CycleCheck(model, motion)
         self.check_collisions = _collision_check(check_collisions, model, motion)
-        self._joints = np.tile(self.check.parked_rad, (model.cell.num_arms, 1))
+        self._joints = np.tile(self.check.home_rad, (model.cell.num_arms, 1))
         self._pose = np.zeros(3)
         self._view: TopView | None = None
 
     def reset(self, pose: Floats, seed: int) -> Floats:
         """Park the arms and put the object at ``pose`` (3,): it is measured there."""
-        self._joints[:] = self.check.parked_rad
+        self._joints[:] = self.check.home_rad
         self.put(pose)
         return self._pose.copy()
 
@@ -111,7 +113,7 @@ class KinematicBackend:
         """Joints of all arms (num_arms, 5)."""
         return self._joints.copy()
 
-    def execute(self, arm: int, paths: CyclePaths) -> Execution:
+    def execute(self, arm: int, paths: PickPlacePaths) -> Execution:
         """Carry out one cycle, if :class:`CycleCheck` has nothing against it."""
         refusal = self.check(arm, paths, self._joints[arm], self._pose[:2])
         if refusal is None and self.check_collisions is not None and self.check_collisions(arm, paths, self.joints_rad()):

@@ -9,10 +9,10 @@ from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.envs.cycle_check import CycleCheck
 from marl_handover.motion.executor import ROLL_RAD
+from marl_handover.motion.path_optimizer import DENSE_SAMPLES, Segment
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.segment import DENSE_SAMPLES, Segment
 from marl_handover.motion.splines import sampled_basis
-from marl_handover.motion.trajectory import CyclePaths
+from marl_handover.motion.trajectory import PickPlacePaths
 
 Floats = NDArray[np.float64]
 
@@ -43,11 +43,11 @@ class CollisionFinder:
         self._planner.warm_up()
         self._dense = np.array(sampled_basis(DENSE_SAMPLES, motion.control_points, motion.degree))
 
-    def __call__(self, arm: int, paths: CyclePaths, joints_rad: Floats) -> bool:
+    def __call__(self, arm: int, paths: PickPlacePaths, joints_rad: Floats) -> bool:
         """Whether the cycle ``paths`` of ``arm`` touches anything, all arms being at ``joints_rad`` (num_arms, 5) before it."""
         if max(float(abs(points[:, 4]).max()) for points in paths) > ROLL_RAD:
             return True
-        planner, other, parked = self._planner, np.delete(joints_rad, arm, 0)[0], self._planner.parked_rad
+        planner, other, parked = self._planner, np.delete(joints_rad, arm, 0)[0], self._planner.home_rad
         pick_mm, place_mm = (self._within_reach(arm, paths.transfer[end]) for end in (0, -1))
         segments = (
             planner.reaching(arm, parked, pick_mm, other, leaving=False)[0],

@@ -12,7 +12,7 @@ from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.motion.splines import knots, sampled_basis
-from marl_handover.motion.trajectory import CyclePaths
+from marl_handover.motion.trajectory import PickPlacePaths
 
 Floats = NDArray[np.float64]
 
@@ -72,12 +72,12 @@ class CycleCheck:
         motion.validate()
         self.model, self.motion = model, motion
         knots(motion.control_points, motion.degree)  # refuses settings that are no spline
-        self.parked_rad = np.radians(motion.parked_deg)
-        if self.parked_rad.shape != model.arm.lower_rad.shape or not model.arm.within_limits(self.parked_rad):
+        self.home_rad = np.radians(motion.parked_deg)
+        if self.home_rad.shape != model.arm.lower_rad.shape or not model.arm.within_limits(self.home_rad):
             raise InvalidSetting("motion.parked_deg", motion.parked_deg, f"{len(model.arm.lower_rad)} angles within the arm's joint limits")
 
     def __call__(
-        self, arm: int, paths: CyclePaths, joints_rad: Floats, object_mm: Floats, target_mm: Floats | None = None
+        self, arm: int, paths: PickPlacePaths, joints_rad: Floats, object_mm: Floats, target_mm: Floats | None = None
     ) -> Refusal | None:
         """The first thing that is wrong, or None.
 
@@ -100,7 +100,7 @@ class CycleCheck:
             return Refusal.OBJECT_ELSEWHERE
         if not self._level_at(arm, paths.transfer[-1], target_mm):
             return Refusal.WRONG_PLACE
-        if _apart(paths.retreat[-1], self.parked_rad) > JOIN_TOLERANCE_RAD:
+        if _apart(paths.retreat[-1], self.home_rad) > JOIN_TOLERANCE_RAD:
             return Refusal.CANNOT_PARK
         return None
 
@@ -123,11 +123,11 @@ class CycleCheck:
         return distance <= END_TOLERANCE_MM and max(abs(pitch), abs(roll)) <= LEVEL_TOLERANCE_RAD
 
 
-def welded(paths: CyclePaths) -> CyclePaths:
+def welded(paths: PickPlacePaths) -> PickPlacePaths:
     """The same cycle, each path beginning exactly where the one before ends; the check lets :data:`JOIN_TOLERANCE_RAD` pass."""
     transfer, retreat = paths.transfer.copy(), paths.retreat.copy()
     transfer[0], retreat[0] = paths.approach[-1], transfer[-1]
-    return CyclePaths(paths.approach, transfer, retreat)
+    return PickPlacePaths(paths.approach, transfer, retreat)
 
 
 def _apart(one: Floats, other: Floats) -> float:

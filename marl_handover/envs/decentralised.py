@@ -22,7 +22,7 @@ from marl_handover.arrays import Array, namespace, one_where
 from marl_handover.cell import NO_ARM, Cell, load_cell
 from marl_handover.config import DecentralisedConfig, TaskConfig
 from marl_handover.envs.supervisor_env import SupervisorEnv
-from marl_handover.motion.cost import motion_cost
+from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.observations import ARM_FIELDS
 from marl_handover.task.rules import Command, Outcome, Rules, Verdict, straight_line_mm
 

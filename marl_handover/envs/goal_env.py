@@ -15,7 +15,7 @@ from marl_handover.cell import Cell, load_cell
 from marl_handover.config import TaskConfig
 from marl_handover.envs.problem_source import ProblemSource
 from marl_handover.errors import NotFinite
-from marl_handover.motion.cost import motion_cost
+from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.observations import observation_size, observe
 from marl_handover.task.rules import Outcome, Rules
 

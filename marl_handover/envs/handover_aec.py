@@ -25,8 +25,8 @@ from marl_handover.envs.backends import Backend, Correctable, KinematicBackend, 
 from marl_handover.envs.cycle_check import FAILURES, CycleCheck, Refusal
 from marl_handover.envs.problem_source import ProblemSource
 from marl_handover.envs.spaces import SUPERVISOR, Spaces
-from marl_handover.motion.cost import motion_cost
 from marl_handover.motion.executor import ARM_AGENTS
+from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.rules import Command, Outcome, Rules, Verdict
 
 Floats = NDArray[np.float64]

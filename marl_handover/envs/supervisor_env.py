@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import TaskConfig, require_at_least, require_positive
-from marl_handover.motion.cost import motion_cost
+from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.observations import observation_size, observe
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules, carried

@@ -1,7 +1,7 @@
 """Compiled geometry of one arm in its own vertical plane: forward kinematics, capsule distances, and what they push on the joints.
 
 Planar frame: r forward along the arm, t to its left, z up from the table; it turns with the base yaw. Wrist roll is 0 throughout.
-Arrays are packed for speed; :mod:`marl_handover.motion.body` makes them:
+Arrays are packed for speed; :mod:`marl_handover.motion.collision_model` makes them:
 
 * ``planar`` (14,): shoulder (r, z), then the vectors shoulder-elbow, elbow-wrist, wrist-grip at zero, in mm; then two balls
   (r, z, radius), one around base and turret, one in the wrist's frame around wrist, hand and what they hold.
@@ -28,7 +28,7 @@ FAR_MM = 1e9
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pivots(planar: Floats, Q: Floats, i: int, frames: Floats, slot: int) -> None:
+def forward_kinematics(planar: Floats, Q: Floats, i: int, frames: Floats, slot: int) -> None:
     """Fill ``frames[slot]`` (5, 4): each level's pivot (r, z) and (cos, sin) of its pitch; Q[i] = (yaw, shoulder, elbow, wrist pitch)."""
     for level in range(2):
         frames[slot, level, 0], frames[slot, level, 1], frames[slot, level, 2], frames[slot, level, 3] = 0.0, 0.0, 1.0, 0.0
@@ -88,7 +88,7 @@ def place_capsules(capsules: Floats, frames: Floats, i: int, ends: Floats) -> No
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def turned(obstacles: Floats, row: int, cos_yaw: float, sin_yaw: float, out: Floats, slot: int) -> None:
+def into_arm_plane(obstacles: Floats, row: int, cos_yaw: float, sin_yaw: float, out: Floats, slot: int) -> None:
     """Put an obstacle into the planar frame: row ``slot`` of ``out`` (., 10), as :func:`place_capsules` does."""
     for e in range(2):
         x, y = obstacles[row, 3 * e], obstacles[row, 3 * e + 1]
@@ -119,7 +119,7 @@ def hand_is_away(planar: Floats, frames: Floats, i: int, need: float) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def beyond(A: Floats, a: int, B: Floats, b: int, limit: float) -> bool:
+def broad_phase(A: Floats, a: int, B: Floats, b: int, limit: float) -> bool:
     """Whether two placed segments, rows of ``A`` and ``B``, are surely farther apart than ``limit``: it spares most distances."""
     dx, dy, dz = A[a, 6] - B[b, 6], A[a, 7] - B[b, 7], A[a, 8] - B[b, 8]
     away = limit + A[a, 9] + B[b, 9]
@@ -127,7 +127,7 @@ def beyond(A: Floats, a: int, B: Floats, b: int, limit: float) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def nearest(A: Floats, a: int, B: Floats, b: int, out: Floats) -> float:
+def closest_points(A: Floats, a: int, B: Floats, b: int, out: Floats) -> float:
     """Distance of two placed segments; ``out`` (6,): the nearest point of the first, then the unit vector from the second's to it.
 
     Exact for parallel segments and points. Where the segments meet, the vector is up: some way out is better than none.
@@ -156,7 +156,7 @@ def nearest(A: Floats, a: int, B: Floats, b: int, out: Floats) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def push(
+def jacobian_transpose(
     frames: Floats, i: int, level: int, r: float, t: float, z: float, nr: float, nt: float, nz: float, weight: float, grad: Floats
 ) -> None:
     """Add ``weight`` x d(n . point)/dq to ``grad[i]`` (4,), for a point (r, t, z) fixed to ``level`` and a constant vector n."""
@@ -172,7 +172,7 @@ def world_shapes(joints: Floats, planar: Floats, capsules: Floats, x: float, y: 
     S, K = joints.shape[0], capsules.shape[0]
     out, frames, ends = np.empty((S, K, 11)), np.empty((1, 5, 4)), np.empty((K, 10))
     for i in range(S):
-        pivots(planar, joints, i, frames, 0)
+        forward_kinematics(planar, joints, i, frames, 0)
         place_capsules(capsules, frames, 0, ends)
         c, s = math.cos(joints[i, 0] + facing), math.sin(joints[i, 0] + facing)
         for k in range(K):
@@ -204,7 +204,7 @@ def can_meet(planar: Floats, capsules: Floats, a: int, b: int, need: float, limi
             for k in range(count[2]):
                 for joint, index in enumerate((i, j, k)):
                     q[0, joint + 1] = limits[joint + 1, 0] + 2.0 * half[joint] * index
-                pivots(planar, q, 0, frames, 0)
+                forward_kinematics(planar, q, 0, frames, 0)
                 place_capsules(capsules, frames, 0, ends)
                 slack = 0.0
                 for joint in range(3):
@@ -215,6 +215,6 @@ def can_meet(planar: Floats, capsules: Floats, a: int, b: int, need: float, limi
                             lever = max(lever, math.sqrt(dr * dr + dz * dz))
                         slack += half[joint] * lever
                 # Levers change on the way too; the bodies are rigid, so by no more than the slack itself.
-                if nearest(ends, a, ends, b, out) < need + 1.12 * slack:
+                if closest_points(ends, a, ends, b, out) < need + 1.12 * slack:
                     return True
     return False

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
 from marl_handover.geometry.capsules import capsule_pairs, joints_before
-from marl_handover.geometry.kernels import FAR_MM, beyond, nearest
+from marl_handover.geometry.kernels import FAR_MM, broad_phase, closest_points
 from marl_handover.geometry.urdf import ARM_JOINTS
 
 Floats = NDArray[np.float64]
@@ -99,8 +99,8 @@ def alone_mm(Q: Floats, shapes: Shapes, out: Floats) -> None:
         for n in range(pairs.shape[0]):
             a, b = pairs[n, 0], pairs[n, 1]
             need = capsules[a, 7] + capsules[b, 7]
-            if not beyond(placed, a, placed, b, need + out[1]):
-                out[1] = min(out[1], nearest(placed, a, placed, b, point) - need)
+            if not broad_phase(placed, a, placed, b, need + out[1]):
+                out[1] = min(out[1], closest_points(placed, a, placed, b, point) - need)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -120,6 +120,6 @@ def between_mm(Q: Floats, others: Floats, together: bool, shapes: Shapes, base: 
             for a in range(K):
                 for b in range(K):
                     need = capsules[a, 7] + capsules[b, 7]
-                    if not beyond(first, a, second[j], b, need + best):
-                        best = min(best, nearest(first, a, second[j], b, point) - need)
+                    if not broad_phase(first, a, second[j], b, need + best):
+                        best = min(best, closest_points(first, a, second[j], b, point) - need)
     return best

@@ -9,7 +9,7 @@ from marl_handover.cell import Cell
 from marl_handover.config import CentralisedConfig
 from marl_handover.learning.algorithm_settings import SacConfig
 from marl_handover.learning.networks import LOG_STD_RANGE, AfterstateCritic, HybridActor, arm_blocks, mlp
-from marl_handover.motion.ways import FIELDS, mirrored_numbers, way_features
+from marl_handover.motion.transfer_features import FIELDS, mirrored_numbers, transfer_features
 from marl_handover.task.observations import ARM_FIELDS
 
 
@@ -44,8 +44,8 @@ class MotionActor(HybridActor):
         return seen[..., :2], seen[..., 2:]
 
     def way(self, arm: Tensor, from_mm: Tensor, to_mm: Tensor) -> tuple[Tensor, Tensor]:
-        """Features (..., fields) and sign (...) of ways; see :func:`way_features`."""
-        return way_features(self.cell, arm, from_mm, to_mm, self.canonical)
+        """Features (..., fields) and sign (...) of ways; see :func:`transfer_features`."""
+        return transfer_features(self.cell, arm, from_mm, to_mm, self.canonical)
 
     def motion(self, way: Tensor) -> tuple[Tensor, Tensor]:
         """Mean before the tanh and log of the deviation, (..., M), of the motions for ways (..., fields), folded as they are."""

@@ -24,7 +24,7 @@ from marl_handover.learning.centralised_networks import MotionActor, MotionCriti
 from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, unpacked
 from marl_handover.learning.networks import arm_blocks, chosen_action, squashed_sample
 from marl_handover.learning.settings import TrainConfig
-from marl_handover.motion.ways import mirrored_numbers
+from marl_handover.motion.transfer_features import mirrored_numbers
 from marl_handover.task.rules import Rules
 
 

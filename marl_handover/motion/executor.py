@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from marl_handover.cell import CellModel, build_cell, cell_config
 from marl_handover.config import CellConfig, MotionConfig, require_choice
 from marl_handover.errors import HandoverError, InvalidSetting
-from marl_handover.motion.grasp import level_joints
-from marl_handover.motion.trajectory import CyclePaths, NoPath, OutOfArmsReach
+from marl_handover.motion.grasp_ik import grasp_joints
+from marl_handover.motion.trajectory import NoPath, OutOfArmsReach, PickPlacePaths
 
 if TYPE_CHECKING:
     from marl_handover.motion.planner import MotionPlanner
@@ -68,20 +68,20 @@ class ExecutorAgent:
             self.last_refusal, reason = None, DECLINED
         except HandoverError as failure:
             self.last_refusal, reason = str(failure), _code(failure)
-            paths = CyclePaths(*(np.tile(joints, (self.motion.control_points, 1)) for _ in range(3)))
+            paths = PickPlacePaths(*(np.tile(joints, (self.motion.control_points, 1)) for _ in range(3)))
         lower, upper = self.model.arm.lower_rad.astype(np.float32), self.model.arm.upper_rad.astype(np.float32)
         willing = np.int64(self.last_refusal is None)
         points = np.clip(np.stack(paths).astype(np.float32), lower, upper)
         return {"paths": points, "grasp": willing, "release": willing, "reason": np.int64(reason)}
 
-    def _direct(self, pick_mm: Floats, place_mm: Floats, joints_rad: Floats) -> CyclePaths:
+    def _direct(self, pick_mm: Floats, place_mm: Floats, joints_rad: Floats) -> PickPlacePaths:
         ends = (
             joints_rad,
-            level_joints(self.model, self.arm, "pick up", pick_mm),
-            level_joints(self.model, self.arm, "place", place_mm),
+            grasp_joints(self.model, self.arm, "pick up", pick_mm),
+            grasp_joints(self.model, self.arm, "place", place_mm),
             np.radians(self.motion.parked_deg),
         )
-        return CyclePaths(*(np.linspace(start, end, self.motion.control_points) for start, end in pairwise(ends)))
+        return PickPlacePaths(*(np.linspace(start, end, self.motion.control_points) for start, end in pairwise(ends)))
 
     def _made_planner(self) -> MotionPlanner:
         if self._planner is None:
@@ -90,10 +90,12 @@ class ExecutorAgent:
             self._planner = MotionPlanner(self.model, self.motion)
         return self._planner
 
-    def _optimised(self, planner: MotionPlanner, pick_mm: Floats, place_mm: Floats, joints_rad: Floats, others_rad: Floats) -> CyclePaths:
+    def _optimised(
+        self, planner: MotionPlanner, pick_mm: Floats, place_mm: Floats, joints_rad: Floats, others_rad: Floats
+    ) -> PickPlacePaths:
         joints = joints_rad.copy()
         joints[4] = joints[4] if abs(joints[4]) > ROLL_RAD else 0.0
-        return planner.cycle(self.arm, pick_mm, place_mm, joints, others_rad).paths
+        return planner.plan_paths(self.arm, pick_mm, place_mm, joints, others_rad).paths
 
 
 def _code(failure: HandoverError) -> int:

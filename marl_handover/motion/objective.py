@@ -18,8 +18,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marl_handover.geometry.kernels import FAR_MM, at_wrist, beyond, hand_is_away, nearest, pivots, place_capsules, push, turned
-from marl_handover.motion.scene import Scene
+from marl_handover.geometry.kernels import (
+    FAR_MM,
+    at_wrist,
+    broad_phase,
+    closest_points,
+    forward_kinematics,
+    hand_is_away,
+    into_arm_plane,
+    jacobian_transpose,
+    place_capsules,
+)
+from marl_handover.motion.collision_model import Scene
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -28,7 +38,7 @@ LEVER_MM = 100.0
 """What one radian counts in mm where joint angles enter a cost or a limit."""
 
 
-class Price(NamedTuple):
+class Penalty(NamedTuple):
     """What violations cost: multipliers ``lam`` (S, C), penalty ``rho`` per mm; ``step`` (S - 1,), the samples' distances in tau.
 
     ``weights`` (2,): of even speed and of joint motion, beside the length.
@@ -76,11 +86,11 @@ def ramp(x: float, y: float, profile: Floats, out: Floats) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def lagrangian(Q: Floats, scene: Scene, price: Price, grad: Floats, values: Floats) -> float:
+def lagrangian(Q: Floats, scene: Scene, penalties: Penalty, grad: Floats, values: Floats) -> float:
     """Cost + penalty of joint samples ``Q`` (S, 4); fills ``grad`` (S, 4) and the constraints ``values`` (S, C) (-FAR_MM: inactive)."""
     # Out of the tuples once: each look into one costs a reference count, here and in every function it is handed to.
     planar, capsules, pairs, obstacles, group = scene.planar, scene.capsules, scene.pairs, scene.obstacles, scene.group
-    clearance, edges, profile, lam, rho = scene.clearance, scene.edges, scene.profile, price.lam, price.rho
+    clearance, edges, profile, lam, rho = scene.clearance, scene.edges, scene.profile, penalties.lam, penalties.rho
     samples, K, P = Q.shape[0], capsules.shape[0], pairs.shape[0]
     frames, grip, ends, point, slope = np.empty((samples, 5, 4)), np.empty((samples, 3)), np.empty((K, 10)), np.empty(6), np.empty(3)
     worst, contact, placed, close = np.empty(K), np.empty((K, 6)), np.empty((1, 10)), np.empty(K, np.int64)
@@ -91,7 +101,7 @@ def lagrangian(Q: Floats, scene: Scene, price: Price, grad: Floats, values: Floa
     values[:, :] = -FAR_MM
     penalty = 0.0
     for i in range(samples):
-        pivots(planar, Q, i, frames, i)
+        forward_kinematics(planar, Q, i, frames, i)
         r, z = at_wrist(frames, i, planar[6], planar[7])
         cy, sy = math.cos(Q[i, 0]), math.sin(Q[i, 0])
         grip[i, 0], grip[i, 1], grip[i, 2] = r * cy, r * sy, z
@@ -113,7 +123,7 @@ def lagrangian(Q: Floats, scene: Scene, price: Price, grad: Floats, values: Floa
         for e in range(edges.shape[0]):
             er, ez = at_wrist(frames, i, edges[e, 0], edges[e, 1])
             penalty += _height(i, before + 1 + e, er, ez, r, z, profile[7] * slope[0], profile[7], sr, st, lam, rho, frames, grad, values)
-    return penalty + _length(Q, planar, price.step, price.weights, frames, grip, grad)
+    return penalty + _length(Q, planar, penalties.step, penalties.weights, frames, grip, grad)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -140,13 +150,13 @@ def _obstacles(
     if count == 0:
         return 0.0
     for j in range(obstacles.shape[0]):
-        turned(obstacles, j, cy, sy, placed, 0)
+        into_arm_plane(obstacles, j, cy, sy, placed, 0)
         for index in range(count):
             k = close[index]
             need = obstacles[j, 6] + obstacles[j, 7] + capsules[k, 7]
-            if beyond(ends, k, placed, 0, need - worst[k]):
+            if broad_phase(ends, k, placed, 0, need - worst[k]):
                 continue
-            over = need - nearest(ends, k, placed, 0, point)
+            over = need - closest_points(ends, k, placed, 0, point)
             if over > worst[k]:
                 worst[k] = over
                 values[i, k] = over
@@ -160,7 +170,7 @@ def _obstacles(
         h = _charge(lam[i, k], rho, values[i, k])
         penalty += 0.5 * h * h / rho
         c = contact
-        push(frames, i, int(capsules[k, 0]), c[k, 0], c[k, 1], c[k, 2], c[k, 3], c[k, 4], c[k, 5], -h, grad)
+        jacobian_transpose(frames, i, int(capsules[k, 0]), c[k, 0], c[k, 1], c[k, 2], c[k, 3], c[k, 4], c[k, 5], -h, grad)
     return penalty
 
 
@@ -180,16 +190,16 @@ def _itself(
     for p in range(start, pairs.shape[0]):
         a, b, held = pairs[p, 0], pairs[p, 1], lam[i, K + p]
         need = clearance + capsules[a, 7] + capsules[b, 7]
-        if beyond(ends, a, ends, b, need + held / rho):
+        if broad_phase(ends, a, ends, b, need + held / rho):
             continue
-        distance = nearest(ends, a, ends, b, point)
+        distance = closest_points(ends, a, ends, b, point)
         values[i, K + p] = need - distance
         h = _charge(held, rho, need - distance)
         if h > 0.0:
             penalty += 0.5 * h * h / rho
-            push(frames, i, int(capsules[a, 0]), point[0], point[1], point[2], point[3], point[4], point[5], -h, grad)
+            jacobian_transpose(frames, i, int(capsules[a, 0]), point[0], point[1], point[2], point[3], point[4], point[5], -h, grad)
             r, t, z = point[0] - distance * point[3], point[1] - distance * point[4], point[2] - distance * point[5]
-            push(frames, i, int(capsules[b, 0]), r, t, z, point[3], point[4], point[5], h, grad)
+            jacobian_transpose(frames, i, int(capsules[b, 0]), r, t, z, point[3], point[4], point[5], h, grad)
     return penalty
 
 
@@ -207,7 +217,7 @@ def _table(
         if h > 0.0:
             values[i, before + k] = over
             penalty += 0.5 * h * h / rho
-            push(frames, i, int(capsules[k, 0]), ends[k, e], ends[k, e + 1], ends[k, e + 2], 0.0, 0.0, 1.0, -h, grad)
+            jacobian_transpose(frames, i, int(capsules[k, 0]), ends[k, e], ends[k, e + 1], ends[k, e + 2], 0.0, 0.0, 1.0, -h, grad)
     return penalty
 
 
@@ -221,8 +231,8 @@ def _height(
     values[i, column] = over
     h = _charge(lam[i, column], rho, over)
     if h > 0.0:
-        push(frames, i, 4, pr, 0.0, pz, 0.0, 0.0, 1.0, -h, grad)
-        push(frames, i, 4, r, 0.0, z, sr, st, 0.0, h * rise, grad)
+        jacobian_transpose(frames, i, 4, pr, 0.0, pz, 0.0, 0.0, 1.0, -h, grad)
+        jacobian_transpose(frames, i, 4, r, 0.0, z, sr, st, 0.0, h * rise, grad)
     return 0.5 * h * h / rho
 
 
@@ -250,7 +260,7 @@ def _length(Q: Floats, planar: Floats, step: Floats, weights: Floats, frames: Fl
             cy, sy = math.cos(Q[i, 0]), math.sin(Q[i, 0])
             r, z = at_wrist(frames, i, planar[6], planar[7])
             gx, gy = px - fx, py - fy
-            push(frames, i, 4, r, 0.0, z, cy * gx + sy * gy, cy * gy - sy * gx, pz - fz, 1.0, grad)
+            jacobian_transpose(frames, i, 4, r, 0.0, z, cy * gx + sy * gy, cy * gy - sy * gx, pz - fz, 1.0, grad)
         px, py, pz = fx, fy, fz
         for j in range(4):
             pull = weights[1] * LEVER_MM * LEVER_MM / (turning * step[i]) * (Q[i + 1, j] - Q[i, j])

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -16,12 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed
-from marl_handover.motion.body import arm_body, ball_around, standing_arm, standing_block
-from marl_handover.motion.grasp import level_joints
-from marl_handover.motion.scene import Scene
-from marl_handover.motion.segment import FoundPath, Segment, find_path
-from marl_handover.motion.starts import GRIP_LEAST_MM, SAMPLES, carrying_starts, reaching_starts
-from marl_handover.motion.trajectory import CyclePaths, TransferMotion
+from marl_handover.motion.collision_model import Scene, arm_collision_model, ball_around, standing_arm, standing_block
+from marl_handover.motion.grasp_ik import grasp_joints
+from marl_handover.motion.initial_guesses import GRIP_LEAST_MM, SAMPLES, carrying_guesses, reaching_guesses
+from marl_handover.motion.path_optimizer import FoundPath, Segment, find_path
+from marl_handover.motion.trajectory import PickPlacePaths, TransferMotion
 
 Floats = NDArray[np.float64]
 
@@ -47,31 +47,43 @@ class MotionPlanner:
     def __init__(self, model: CellModel, motion: MotionConfig | None = None) -> None:
         self.model, self.motion = model, motion or MotionConfig()
         self.motion.validate()
-        self.parked_rad = np.radians(np.asarray(self.motion.parked_deg, float))
-        if not model.arm.within_limits(self.parked_rad):
+        self.home_rad = np.radians(np.asarray(self.motion.parked_deg, float))
+        if not model.arm.within_limits(self.home_rad):
             raise InvalidSetting("motion.parked_deg", self.motion.parked_deg, "angles within the joint limits")
-        self.body = arm_body(model, self.motion)
+        self.collision_model = arm_collision_model(model, self.motion)
         self.clearance_mm = np.array([self.motion.self_clearance_mm, self.motion.ground_clearance_mm])
         self._standing: tuple[tuple[int, bytes], Floats] = ((-1, b""), np.zeros((0, 9)))  # the last one asked for
         self.pick_height_mm = float(model.cell.config.pick_height_mm)
 
-    def cycle(
+    def pick_place(
         self, arm: int, pick_mm: ArrayLike, place_mm: ArrayLike, joints_rad: ArrayLike, other_joints_rad: ArrayLike
     ) -> TransferMotion:
-        """Everything of one transfer, planned, checked and timed.
+        """One transfer, planned, checked and timed. Arguments and errors as :meth:`plan_paths`."""
+        begun = time.perf_counter()
+        motion = self.timed(self.plan_paths(arm, pick_mm, place_mm, joints_rad, other_joints_rad))
+        return replace(motion, planning_ms=1e3 * (time.perf_counter() - begun))
+
+    def timed(self, motion: TransferMotion) -> TransferMotion:
+        """The motion with its phases."""
+        from marl_handover.motion.pick_place import timed_phases
+
+        return replace(motion, phases=timed_phases(motion.paths, self.model.arm, self.motion, self.pick_height_mm))
+
+    def plan_paths(
+        self, arm: int, pick_mm: ArrayLike, place_mm: ArrayLike, joints_rad: ArrayLike, other_joints_rad: ArrayLike
+    ) -> TransferMotion:
+        """The paths of one transfer, planned and checked; its ``phases`` are empty until somebody times them.
 
         Args:
             arm: index.
             pick_mm: (2,) world position of the pin.
             place_mm: (2,) where it goes.
-            joints_rad: (5,) where the arm is now; it ends parked.
+            joints_rad: (5,) where the arm is now; it ends at its home pose.
             other_joints_rad: (5,) where the other arm holds still.
 
         Raises:
             OutOfArmsReach, NoPath, NotFinite: why there is no such motion.
         """
-        from marl_handover.motion.cycle import timed_phases
-
         begun = time.perf_counter()
         pick, place = (self._finite(name, value, 2) for name, value in (("pick_mm", pick_mm), ("place_mm", place_mm)))
         joints, other = (
@@ -79,12 +91,11 @@ class MotionPlanner:
         )
         transfer = self.transfer(arm, pick, place, other)
         approach = self.reach(arm, joints, pick, other, leaving=False)
-        retreat = self.reach(arm, self.parked_rad, place, other, leaving=True)
-        paths = CyclePaths(approach.points, transfer.points, retreat.points)
-        phases = timed_phases(paths, self.model.arm, self.motion, self.pick_height_mm)
+        retreat = self.reach(arm, self.home_rad, place, other, leaving=True)
+        paths = PickPlacePaths(approach.points, transfer.points, retreat.points)
         clearance = min(found.margins.arm for found in (approach, transfer, retreat)) + self.motion.arm_clearance_mm
         spent = 1e3 * (time.perf_counter() - begun)
-        return TransferMotion(arm, pick, place, paths, phases, other, transfer.length_mm, clearance, spent)
+        return TransferMotion(arm, pick, place, paths, (), other, transfer.length_mm, clearance, spent)
 
     def warm_up(self) -> None:
         """Plan and time one cycle, so that what is compiled on first use is; where that takes long, say so on stderr."""
@@ -95,17 +106,17 @@ class MotionPlanner:
             cell = self.model.cell
             pick, place = cell.bases[0].around((cell.r_min_mm + cell.r_max_mm) / 2, (-0.3, 0.3))
             with suppress(WorkFailed):  # settings under which nothing can move are for the first real command to name
-                self.cycle(0, pick, place, self.parked_rad, self.parked_rad)
+                self.pick_place(0, pick, place, self.home_rad, self.home_rad)
         finally:
             notice.cancel()
 
     def transfer(self, arm: int, pick_mm: Floats, place_mm: Floats, other_joints_rad: Floats) -> FoundPath:
-        """The path of the loaded hand from pick to place (world, mm). Raises as :meth:`cycle`."""
+        """The path of the loaded hand from pick to place (world, mm). Raises as :meth:`plan_paths`."""
         segment, guesses = self.carrying(arm, pick_mm, place_mm, other_joints_rad)
         if self.motion.method == "paper":
-            from marl_handover.motion.paper_method import plan_paper
+            from marl_handover.motion.slsqp_planner import plan_slsqp
 
-            return plan_paper(segment, tolerance_mm=PAPER_TOLERANCE_MM)
+            return plan_slsqp(segment, tolerance_mm=PAPER_TOLERANCE_MM)
         if math.dist(pick_mm, place_mm) < STILL_MM:
             guesses = iter([np.linspace(segment.ends[0], segment.ends[1], SAMPLES)])
         return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.starts)
@@ -122,11 +133,11 @@ class MotionPlanner:
         others = self._other(arm, other_joints_rad)
         bound = string_length(distance, scale, lift_mm)
         expected = bound + detour_length(ends_mm, GRIP_LEAST_MM)
-        segment = Segment(self.body, self._scene(True, others, len(others), profile), ends, bound, expected)
-        return segment, carrying_starts(self.body, ends, ends_mm, self.pick_height_mm, lift_mm)
+        segment = Segment(self.collision_model, self._scene(True, others, len(others), profile), ends, bound, expected)
+        return segment, carrying_guesses(self.collision_model, ends, ends_mm, self.pick_height_mm, lift_mm)
 
     def reach(self, arm: int, joints_rad: Floats, pin_mm: Floats, other_joints_rad: Floats, *, leaving: bool) -> FoundPath:
-        """The path of the empty hand from ``joints_rad`` to the pin, or, ``leaving``, from the pin to them. Raises as :meth:`cycle`."""
+        """The path of the empty hand from ``joints_rad`` to the pin, or, ``leaving``, from it to them. Raises as :meth:`plan_paths`."""
         segment, guesses = self.reaching(arm, joints_rad, pin_mm, other_joints_rad, leaving=leaving)
         return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.starts, wanted=1)
 
@@ -144,16 +155,18 @@ class MotionPlanner:
         profile = np.array([*pin, *pin, *scales, self.motion.lift_mm, self.motion.ground_clearance_mm])
         others = self._other(arm, other_joints_rad)
         obstacles = np.concatenate([others, standing_block(self.model, self.motion, pin)])
-        segment = Segment(self.body, self._scene(False, obstacles, len(others), profile), ends, 0.0, 0.0)
-        return segment, reaching_starts(self.body, ends, np.array([*pin, self.pick_height_mm]), self.motion.lift_mm, not leaving)
+        segment = Segment(self.collision_model, self._scene(False, obstacles, len(others), profile), ends, 0.0, 0.0)
+        return segment, reaching_guesses(
+            self.collision_model, ends, np.array([*pin, self.pick_height_mm]), self.motion.lift_mm, not leaving
+        )
 
     def grasp_joints(self, arm: int, what: str, position_mm: Floats) -> Floats:
         """Joints (5,) that hold the pin at a world position (2,) with pitch = roll = 0. Raises :class:`OutOfArmsReach`."""
-        return level_joints(self.model, arm, what, position_mm)
+        return grasp_joints(self.model, arm, what, position_mm)
 
     def _scene(self, holding: bool, obstacles: Floats, arm_rows: int, profile: Floats) -> Scene:
         """The arm, empty or with the block, among obstacles."""
-        body = self.body
+        body = self.collision_model
         capsules, pairs, edges = (body.held, body.held_pairs, body.edges) if holding else (body.capsules, body.pairs, body.edges[:0])
         carried, group = len(body.capsules), ball_around(obstacles)
         return Scene(
@@ -176,7 +189,7 @@ class MotionPlanner:
                 continue
             turn = base.facing_rad - bases[arm].facing_rad
             x_mm, y_mm = self.in_base(arm, base.position_mm)
-            rows.append(standing_arm(self.body, self.model.arm, self.motion, joints_rad, float(x_mm), float(y_mm), turn))
+            rows.append(standing_arm(self.collision_model, self.model.arm, self.motion, joints_rad, float(x_mm), float(y_mm), turn))
         self._standing = (key, np.concatenate(rows))
         return self._standing[1]
 

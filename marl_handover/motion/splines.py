@@ -6,6 +6,7 @@ Clamped: the path starts at the first control point and ends at the last. A path
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -37,6 +38,15 @@ def sampled_basis(samples: int, control_points: int, degree: int, derivative: in
     values = basis(np.linspace(0.0, 1.0, samples), control_points, degree, derivative)
     values.setflags(write=False)
     return values
+
+
+@lru_cache(maxsize=16)
+def sample_places(samples: int, crowding: float) -> Floats:
+    """Values of tau (S,) from 0 to 1, denser towards both ends, where the lift-over profile is steep."""
+    even = np.linspace(0.0, 1.0, samples)
+    tau: Floats = even - crowding * np.sin(2 * math.pi * even) / (2 * math.pi)
+    tau[0], tau[-1] = 0.0, 1.0
+    return tau
 
 
 def evaluate(control_points: ArrayLike, tau: ArrayLike, degree: int, derivative: int = 0) -> Floats:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from marl_handover.envs.centralised import CentralisedRules
 from marl_handover.errors import InvalidSetting
-from marl_handover.motion.ways import mirrored_numbers, way_features
+from marl_handover.motion.transfer_features import mirrored_numbers, transfer_features
 from marl_handover.policies.files import network_layers
 from marl_handover.policies.network import NetworkPolicy
 from marl_handover.policies.policy import Floats, SupervisorPolicy
@@ -72,7 +72,7 @@ class CentralisedPolicy(NetworkPolicy):
         cell = self.rules.cell
         command = Rules.decode(self.rules, decision)
         to = np.where(command.final[..., None], goal[..., :2], command.place_mm)
-        way, sign = way_features(cell, command.arm, pose[..., :2], to, self.about["canonical"])
+        way, sign = transfer_features(cell, command.arm, pose[..., :2], to, self.about["canonical"])
         outputs = self._forward(way.astype(np.float32), self.moving)
         numbers = np.tanh(outputs[..., : outputs.shape[-1] // 2])
         return np.concatenate([decision, mirrored_numbers(numbers, sign)], -1)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import CellConfig, CentralisedConfig, MotionConfig, TaskConfig
 from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, MissingFile, UnknownChoice, first_line
-from marl_handover.motion.cost import motion_cost
+from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.policies.baselines import ExactPolicy, GreedyPolicy, RandomPolicy
 from marl_handover.policies.files import KINDS, read_policy, require_policy, stored_settings
 from marl_handover.policies.policy import SupervisorPolicy

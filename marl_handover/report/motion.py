@@ -17,10 +17,10 @@ from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import MotionConfig
 from marl_handover.errors import CorruptFile, InvalidSetting
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.motion.trajectory import PHASES, CyclePaths, Phase, TransferMotion
+from marl_handover.motion.trajectory import LOADED_PHASES, PHASES, Phase, PickPlacePaths, TransferMotion
 from marl_handover.report.palette import BLUE, FAINT, GREY, INK, PAPER, RED, YELLOW, arm_colour
 from marl_handover.report.table import Axes, draw_bases, draw_sectors, frame_table
-from marl_handover.runtime.motions import CARRYING, clearances_mm, grip_mm
+from marl_handover.runtime.motions import clearances_mm, grip_mm
 
 Floats = NDArray[np.float64]
 
@@ -53,21 +53,21 @@ def read_motions(content: Mapping[str, Any], path: Path) -> list[TransferMotion]
 def require_fit(motions: Sequence[TransferMotion], model: CellModel) -> None:
     """Raise :class:`InvalidSetting` unless the hand is at the block where the motions take it: they are of another cell."""
     for motion in motions:
-        taken = next(phase.joints_rad[0] for phase in motion.phases if phase.name in CARRYING)
+        taken = next(phase.joints_rad[0] for phase in motion.phases if phase.name in LOADED_PHASES)
         if np.linalg.norm(grip_mm(model, motion.arm, taken)[:2] - motion.from_mm) > _FIT_MM:
             raise InvalidSetting("cell", model.cell.config.name, "the cell of the motions; this one's arms would miss the block with them")
 
 
 def _motion(row: Mapping[str, Any]) -> TransferMotion:
     phases = tuple(_phase(part) for part in row["phases"])
-    if not any(phase.name in CARRYING for phase in phases):
+    if not any(phase.name in LOADED_PHASES for phase in phases):
         raise ValueError("a transfer has no phase in which the block is carried")
     none = np.empty((0, 5))
     return TransferMotion(
         arm=ARM_LETTERS.index(row["arm"]),
         from_mm=_numbers(row["from"], 2),
         to_mm=_numbers(row["to"], 2),
-        paths=CyclePaths(none, none, none),
+        paths=PickPlacePaths(none, none, none),
         phases=phases,
         other_joints_rad=_numbers(row["parked_other_rad"], 5),
         path_length_mm=float(row["path_length_mm"]),
@@ -114,7 +114,7 @@ def motion_figure(motions: Sequence[TransferMotion], model: CellModel, settings:
 
 def _pieces(motion: TransferMotion, model: CellModel) -> list[tuple[bool, Floats]]:
     """The grip's path (n, 3) in each phase, and whether the block is carried in it."""
-    return [(phase.name in CARRYING, grip_mm(model, motion.arm, phase.joints_rad)) for phase in motion.phases]
+    return [(phase.name in LOADED_PHASES, grip_mm(model, motion.arm, phase.joints_rad)) for phase in motion.phases]
 
 
 def _draw_above(axes: Axes, motions: Sequence[TransferMotion], model: CellModel) -> None:
@@ -222,7 +222,7 @@ def _draw_clearance(axes: Axes, motions: Sequence[TransferMotion], model: CellMo
 def _shade(axes: Axes, motions: Sequence[TransferMotion], starts: Floats, labels: bool = True) -> None:
     """A band where the block is carried, in the arm's colour, and a line between transfers."""
     for number, (motion, begin_s) in enumerate(zip(motions, starts, strict=False), start=1):
-        carried = [phase for phase in motion.phases if phase.name in CARRYING]
+        carried = [phase for phase in motion.phases if phase.name in LOADED_PHASES]
         zero = motion.phases[0].t_s[0]
         axes.axvspan(begin_s + carried[0].t_s[0] - zero, begin_s + carried[-1].t_s[-1] - zero, color=arm_colour(motion.arm), alpha=0.08)
         axes.axvline(begin_s + motion.duration_s, color=FAINT, linewidth=0.8)

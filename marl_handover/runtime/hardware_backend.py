@@ -21,8 +21,8 @@ from marl_handover.envs.backends import Execution
 from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
 from marl_handover.errors import WorkFailed
 from marl_handover.hardware.settings import HardwareConfig
-from marl_handover.motion.cycle import timed_phases
-from marl_handover.motion.trajectory import CyclePaths, Phase
+from marl_handover.motion.pick_place import timed_phases
+from marl_handover.motion.trajectory import LOADED_PHASES, Phase, PickPlacePaths
 from marl_handover.perception.calibration import Pixels
 from marl_handover.runtime.events import Event
 from marl_handover.runtime.lab import open_lab
@@ -147,7 +147,7 @@ class HardwareBackend:
             self._wait_for_reach()
         return self._last.pose.copy()
 
-    def execute(self, arm: int, paths: CyclePaths) -> Execution:
+    def execute(self, arm: int, paths: PickPlacePaths) -> Execution:
         """Time one cycle of ``arm``, play it, park, look; the other arm holds still.
 
         Raises:
@@ -177,7 +177,7 @@ class HardwareBackend:
             self._unseen = True
             return Execution(before.copy(), self.joints_rad(), path_mm, Refusal.UNSEEN)
         failure = self._failure(arm, before, pose, place) if played else self._unplayed(before, pose, phases)
-        return Execution(pose, self.joints_rad(), path_mm, failure)
+        return Execution(pose, self.joints_rad(), path_mm, failure, float(phases[-1].t_s[-1]))
 
     def render(self) -> Pixels:
         """The camera's picture, RGB (height, width, 3)."""
@@ -266,7 +266,7 @@ class HardwareBackend:
 
     def _length_mm(self, arm: int, phases: Sequence[Phase]) -> float:
         """Of the grip's path while it holds the block."""
-        carrying = [phase.joints_rad for phase in phases if phase.name in ("lift", "transfer", "lower")]
+        carrying = [phase.joints_rad for phase in phases if phase.name in LOADED_PHASES]
         steps = np.diff(self.check.grip_mm(arm, np.concatenate(carrying)), axis=0)
         return float(np.sqrt((steps**2).sum(-1)).sum())
 

@@ -20,8 +20,8 @@ from marl_handover.envs.backends import Backend, make_backend
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.errors import HandoverError
 from marl_handover.learning.rollout import nobody_moves
-from marl_handover.motion.cost import motion_cost
 from marl_handover.motion.executor import ROLL_RAD
+from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import OutOfArmsReach, TransferMotion
 from marl_handover.policies import SupervisorPolicy
@@ -195,17 +195,18 @@ class ClosedLoop:
             return Done(pose, reason, str(failure))
         execution = self.backend.execute(order.arm, motion.paths)
         truth = self.backend.true_pose() if isinstance(self.backend, Truthful) else None
-        return Done(execution.pose, execution.refusal, "", motion.planning_ms, motion.duration_s, execution.path_mm, truth)
+        duration_s = self.planner.timed(motion).duration_s if execution.duration_s is None else execution.duration_s
+        return Done(execution.pose, execution.refusal, "", motion.planning_ms, duration_s, execution.path_mm, truth)
 
     def _plan(self, order: Order, pose: Floats, seen: Floats) -> TransferMotion:
         joints = self.backend.joints_rad()
         own, other = self._settled(joints[order.arm]), np.delete(joints, order.arm, axis=0)[0]
         try:
-            return self.planner.cycle(order.arm, pose[:2], order.place_mm, own, other)
+            return self.planner.plan_paths(order.arm, pose[:2], order.place_mm, own, other)
         except OutOfArmsReach:
             if np.array_equal(seen, pose):
                 raise
-            return self.planner.cycle(order.arm, seen[:2], order.place_mm, own, other)
+            return self.planner.plan_paths(order.arm, seen[:2], order.place_mm, own, other)
 
     def _settled(self, joints_rad: Floats) -> Floats:
         """An arm's measured joints (5,) as a plan can begin with: a servo's droop past a limit or off roll 0 is taken away."""

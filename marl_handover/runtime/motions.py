@@ -14,14 +14,11 @@ from marl_handover.config import MotionConfig
 from marl_handover.errors import WorkFailed
 from marl_handover.geometry.capsules import Capsule, capsule_pairs, ground_clearance_mm, segment_distance
 from marl_handover.geometry.se3 import apply
-from marl_handover.motion.body import block_capsules
+from marl_handover.motion.collision_model import block_capsules
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.trajectory import TransferMotion
+from marl_handover.motion.trajectory import LOADED_PHASES, TransferMotion
 
 Floats = NDArray[np.float64]
-
-CARRYING = ("lift", "transfer", "lower")
-"""Phases in which the hand holds the block."""
 
 
 class NoMotion(WorkFailed):
@@ -38,10 +35,10 @@ def plan_motions(planner: MotionPlanner, transfers: Iterable[tuple[int, Floats, 
     Raises:
         NoMotion: if one of them is not possible.
     """
-    parked, motions = planner.parked_rad, []
+    parked, motions = planner.home_rad, []
     for number, (arm, start, end) in enumerate(transfers, start=1):
         try:
-            motions.append(planner.cycle(arm, start, end, parked, parked))
+            motions.append(planner.pick_place(arm, start, end, parked, parked))
         except WorkFailed as failure:
             raise NoMotion(number, ARM_LETTERS[arm], str(failure)) from failure
     return motions
@@ -75,7 +72,7 @@ def clearances_mm(model: CellModel, settings: MotionConfig, motion: TransferMoti
     other = _capsules(model, settings, 1 - motion.arm, motion.other_joints_rad, False)
     to_arm, to_table = [], []
     for phase in motion.phases:
-        own = _capsules(model, settings, motion.arm, phase.joints_rad, phase.name in CARRYING)
+        own = _capsules(model, settings, motion.arm, phase.joints_rad, phase.name in LOADED_PHASES)
         to_arm.append(_least_gap(own, other))
         to_table.append(ground_clearance_mm(model.arm, phase.joints_rad))
     return np.concatenate(to_arm), np.concatenate(to_table)

@@ -12,7 +12,7 @@ from marl_handover.hardware.errors import BadReply, BoardReset, DeviceError, Not
 from marl_handover.hardware.gate import GateRejection
 from marl_handover.hardware.session import State
 from marl_handover.hardware.streaming import stream
-from marl_handover.motion.trajectory import Phase
+from marl_handover.motion.trajectory import LOADED_PHASES, Phase
 from marl_handover.runtime.events import Event
 from marl_handover.runtime.lab import Lab
 
@@ -27,8 +27,6 @@ _ASTRAY_S = 0.2
 _RETRY_S = 0.5
 _COMMITTED_S = 0.25
 """So long before the hand is at the pin it goes on, whatever is seen: it hides the block."""
-
-_HOLDING = ("lift", "transfer", "lower")
 
 
 class Mover:
@@ -171,7 +169,7 @@ class Mover:
 
     def _go_home(self, arm: int, phases: Sequence[Phase]) -> bool:
         """An arm that must not go on goes straight home, if the way is clear and its hand empty; else somebody has to help. False."""
-        holding = any(phase.name in _HOLDING and phase.t_s[0] <= self.reached_s <= phase.t_s[-1] for phase in phases)
+        holding = any(phase.name in LOADED_PHASES and phase.t_s[0] <= self.reached_s <= phase.t_s[-1] for phase in phases)
         try:
             if holding:
                 raise WrongState("drive home", "holding the block", "an empty hand")

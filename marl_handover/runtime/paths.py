@@ -11,7 +11,7 @@ from marl_handover.arrays import one_where
 from marl_handover.config import MotionConfig
 from marl_handover.envs.centralised import CentralisedRules, MotionCommand
 from marl_handover.learning.rollout import Decision
-from marl_handover.motion.cost import known_table
+from marl_handover.motion.path_length_table import known_table
 from marl_handover.task.rules import Rules
 
 CHUNK = 2000
@@ -20,8 +20,8 @@ CHUNK = 2000
 class PathLengths:
     """An observer of roll-outs that remembers every commanded transfer that was carried out.
 
-    The executors' lengths come from the table of path costs (:mod:`marl_handover.motion.cost`, 0.1 mm off in the median), for cells that
-    have one; nothing is computed for others. Architecture A's external transfers are not counted.
+    The executors' lengths come from :mod:`marl_handover.motion.path_length_table`, 0.1 mm off in the median, for cells that have a
+    table; nothing is computed for others. Architecture A's external transfers are not counted.
     """
 
     def __init__(self, rules: Rules) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.errors import HandoverError
 from marl_handover.hardware.settings import ARMS
+from marl_handover.motion.trajectory import LOADED_PHASES
 from marl_handover.palette import FAINT, PAPER, YELLOW
 from marl_handover.perception.camera import Frame
 from marl_handover.perception.overlay import Mark
@@ -25,9 +26,6 @@ from marl_handover.runtime.reach import drawn_in
 from marl_handover.runtime.steering import Desk
 
 Floats = NDArray[np.float64]
-
-HOLDING = ("lift", "transfer", "lower")
-"""Phases in which the block is in the hand."""
 
 _JOINT_DIGITS, _SEEN_DIGITS = 4, 3
 
@@ -123,7 +121,7 @@ class Portrait:
                     "joints_rad": joints[arm].tolist() if known else None,
                     "gripper_mm": round(fingers, 2) if math.isfinite(fingers) else None,
                     "moving": digest.begun and digest.arm == arm,
-                    "holding": digest.arm == arm and phase in HOLDING,
+                    "holding": digest.arm == arm and phase in LOADED_PHASES,
                     "stalled": arm in digest.stalled,
                 }
             )

@@ -92,7 +92,7 @@ class Session:
         self.printed = PrintedGoal(self.backend)
         """The printed marker, of all episodes."""
         rules = loop.rules
-        parked = self.backend.check.parked_rad
+        parked = self.backend.check.home_rad
         self.log.add(
             Event.SESSION,
             **about,
@@ -100,7 +100,7 @@ class Session:
             epsilon_rad=rules.epsilon_rad,
             symmetry_order=rules.config.symmetry_order,
             position_tolerance_mm=rules.config.position_tolerance_mm,
-            parked_rad=parked,
+            home_rad=parked,
         )
 
     def play(self, start: ArrayLike, goals: Goals, seed: int = 0) -> Episode:

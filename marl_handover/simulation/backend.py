@@ -12,8 +12,8 @@ from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.envs.backends import Execution
 from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
-from marl_handover.motion.cycle import timed_phases
-from marl_handover.motion.trajectory import CyclePaths, Phase
+from marl_handover.motion.pick_place import timed_phases
+from marl_handover.motion.trajectory import Phase, PickPlacePaths
 from marl_handover.simulation.camera import TOP, Camera
 from marl_handover.simulation.engine import Floats
 from marl_handover.simulation.world import BulletCell, RunReport
@@ -68,7 +68,7 @@ class BulletBackend:
         """Where the joints of all arms are: (num_arms, 5)."""
         return self.cell.joints_rad()
 
-    def execute(self, arm: int, paths: CyclePaths) -> Execution:
+    def execute(self, arm: int, paths: PickPlacePaths) -> Execution:
         """Time one cycle of ``arm`` and carry it out; the others hold still."""
         refusal = self.check(arm, paths, self.joints_rad()[arm], self.cell.object_pose()[:2])
         if refusal is not None:
@@ -81,7 +81,8 @@ class BulletBackend:
         trace = np.array(self.last.arms[arm].trace_rad).reshape(-1, 5)
         steps = np.diff(self.check.grip_mm(arm, trace), axis=0)
         length_mm = float(np.sqrt((steps**2).sum(-1)).sum())
-        return Execution(self.cell.object_pose(), self.joints_rad(), length_mm, self._failure(arm, self.last))
+        duration_s = float(phases[-1].t_s[-1] - phases[0].t_s[0])
+        return Execution(self.cell.object_pose(), self.joints_rad(), length_mm, self._failure(arm, self.last), duration_s)
 
     def _failure(self, arm: int, report: RunReport) -> Refusal | None:
         """What went wrong, worst first: whatever else happened, nobody can grip a block that has tipped over."""

@@ -91,7 +91,7 @@ class BulletCell:
     def __init__(self, model: CellModel, motion: MotionConfig, *, grasp: str = "friction", gui: bool = False) -> None:
         require_choice("grasp", grasp, GRASPS)
         self.model, self.motion, self.grasp = model, motion, grasp
-        self.parked_rad = np.radians(motion.parked_deg)
+        self.home_rad = np.radians(motion.parked_deg)
         self.engine = Engine(gui)
         self.reset((0.0, 0.0, 0.0))
 
@@ -114,7 +114,7 @@ class BulletCell:
         self._bonds: dict[int, int] = {}
         self._holding: set[int] = set()
         for arm in self.arms:
-            arm.place(self.parked_rad, self.motion.finger_travel_mm)
+            arm.place(self.home_rad, self.motion.finger_travel_mm)
         self.block.place(np.asarray(pose, dtype=float))
         self.settle()
         self.engine.time_s = 0.0

@@ -153,9 +153,9 @@ class LivePage:
         if known and all(joints is not None for joints in known):
             opened = [arm["gripper_mm"] is None or arm["gripper_mm"] > _OPEN_MM for arm in arms]
             scene.show_joints(np.array(known), opened)
-        elif not self._said.get("joints") and state.get("parked_rad"):
+        elif not self._said.get("joints") and state.get("home_rad"):
             self._said["joints"] = "parked"
-            scene.show_joints(np.tile(state["parked_rad"], (scene.model.cell.num_arms, 1)))
+            scene.show_joints(np.tile(state["home_rad"], (scene.model.cell.num_arms, 1)))
         scene.show_block(self._block(scene.model, state))
         scene.show_goal(state.get("goal"))
         steps = state.get("plan", ())

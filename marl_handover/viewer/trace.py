@@ -130,7 +130,7 @@ class TracePage:
 
     def _park(self) -> None:
         arms = self.scene.model.cell.num_arms
-        self.scene.show_joints(np.tile(self.motions.planner.parked_rad, (arms, 1)), [True] * arms)
+        self.scene.show_joints(np.tile(self.motions.planner.home_rad, (arms, 1)), [True] * arms)
 
     def _play_on(self, dt_s: float) -> None:
         """The next piece of the motion from this moment to the next."""

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.errors import HandoverError
-from marl_handover.motion.grasp import level_joints
+from marl_handover.motion.grasp_ik import grasp_joints
 from marl_handover.motion.planner import MotionPlanner
+from marl_handover.motion.trajectory import LOADED_PHASES
 from marl_handover.runtime.interactive.body import lying
 from marl_handover.viewer.trace_file import Recorded, Step
 
@@ -78,10 +79,10 @@ class Motions:
 
     def placed(self, step: Step) -> Floats:
         """Joints (n, 5) of the arms as a transfer ends: the one holds what it has put down, if it has; the others are parked."""
-        joints = np.tile(self.planner.parked_rad, (self.model.cell.num_arms, 1))
+        joints = np.tile(self.planner.home_rad, (self.model.cell.num_arms, 1))
         if not step.trouble:
             with suppress(HandoverError):  # put down beyond what exact arms reach
-                joints[step.arm] = level_joints(self.model, step.arm, "place", step.next_state[:2])
+                joints[step.arm] = grasp_joints(self.model, step.arm, "place", step.next_state[:2])
         return joints
 
     def _make(self, step: Step) -> Motion:
@@ -93,11 +94,11 @@ class Motions:
         return self._straight(step)
 
     def _planned(self, step: Step) -> Motion:
-        parked = self.planner.parked_rad
-        planned = self.planner.cycle(step.arm, step.state[:2], step.next_state[:2], parked, parked)
+        parked = self.planner.home_rad
+        planned = self.planner.pick_place(step.arm, step.state[:2], step.next_state[:2], parked, parked)
         names = [phase.name for phase in planned.phases for _ in phase.t_s]
         own = np.concatenate([phase.joints_rad for phase in planned.phases])
-        held = np.array([name in ("lift", "transfer", "lower") for name in names])
+        held = np.array([name in LOADED_PHASES for name in names])
         opened = np.concatenate([phase.gripper_mm for phase in planned.phases]) > self.planner.motion.finger_travel_mm / 2
         joints = np.tile(parked, (len(own), self.model.cell.num_arms, 1))
         joints[:, step.arm] = own
@@ -117,7 +118,7 @@ class Motions:
         share = np.linspace(0.0, 1.0, _STRAIGHT_SAMPLES)
         turn = np.angle(np.exp(1j * (step.next_state[2] - step.state[2])))
         poses = step.state + share[:, None] * np.array([*(step.next_state[:2] - step.state[:2]), turn])
-        joints = np.tile(self.planner.parked_rad, (len(share), self.model.cell.num_arms, 1))
+        joints = np.tile(self.planner.home_rad, (len(share), self.model.cell.num_arms, 1))
         grips = np.ones(joints.shape[:2], bool)
         return Motion(STRAIGHT_S * share, joints, grips, np.stack([lying(pose) for pose in poses]))
 

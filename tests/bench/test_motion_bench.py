@@ -14,9 +14,9 @@ import motion_peers
 import transfers
 
 from marl_handover.cell import build_cell, cell_config
+from marl_handover.motion.ompl_planner import STEP_RAD
+from marl_handover.motion.path_optimizer import NoPath
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.segment import NoPath
-from marl_handover.motion.witness import STEP_RAD
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from marl_handover.learning import evaluation
 from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.trainer import Trainer
-from marl_handover.motion.cost import cache_file, cost_table, settings_key
+from marl_handover.motion.path_length_table import cache_file, path_length_table, settings_key
 from marl_handover.task.rules import Rules
 
 FIELDS = {
@@ -338,7 +338,7 @@ def test_transfers_are_priced_as_the_arms_move(tmp_path, monkeypatch):
     """By a table for these motion settings, kept where the package looks for it, in which every way is 700 mm long."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     cell, motion = load_cell(), MotionConfig(lift_mm=31.0)
-    usual = cost_table(cell, MotionConfig())
+    usual = path_length_table(cell, MotionConfig())
     table = replace(usual, key=settings_key(cell, motion), string_mm=0 * usual.string_mm + 700.0, excess_mm=0 * usual.excess_mm)
     cache_file(table.key).parent.mkdir(parents=True)
     table.save(cache_file(table.key))

@@ -19,10 +19,10 @@ from marl_handover.envs.collision_check import CollisionFinder
 from marl_handover.envs.cycle_check import JOIN_TOLERANCE_RAD, CycleCheck, welded
 from marl_handover.envs.top_view import BLOCK, GOAL, PLACE, TopView
 from marl_handover.errors import InvalidSetting, UnknownChoice
-from marl_handover.motion.cycle import timed_phases
 from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
+from marl_handover.motion.pick_place import timed_phases
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.trajectory import CyclePaths
+from marl_handover.motion.trajectory import PickPlacePaths
 from marl_handover.task.rules import Command, Rules
 
 MOTION = MotionConfig()
@@ -49,7 +49,7 @@ def cycle(model, arm, pick_mm, place_mm, joints=PARKED):
         local = [math.cos(angle) * dx + math.sin(angle) * dy, math.cos(angle) * dy - math.sin(angle) * dx, model.cell.config.pick_height_mm]
         ends.append(model.arm.ik(local)[0])
     ends.append(PARKED)
-    return CyclePaths(*(np.linspace(*pair, MOTION.control_points) for pair in pairwise(ends)))
+    return PickPlacePaths(*(np.linspace(*pair, MOTION.control_points) for pair in pairwise(ends)))
 
 
 def good(model):
@@ -60,7 +60,7 @@ def changed(paths, path, point, joint, value):
     """The same cycle with one number of one control point replaced."""
     arrays = {name: array.copy() for name, array in paths._asdict().items()}
     arrays[path][point, joint] = value
-    return CyclePaths(**arrays)
+    return PickPlacePaths(**arrays)
 
 
 def started(backend_class, model, **options):
@@ -180,7 +180,7 @@ def bent(paths, path, joint, angle_rad):
     ids=["the block into the table", "the hand on its way there", "the hand on its way back", "the block on its side"],
 )
 def test_a_path_through_the_table_is_refused_when_that_is_looked_for(paper_model, careful, path, joint, angle_deg):
-    planned = MotionPlanner(paper_model, MOTION).cycle(0, START[:2], PLACE_MM, PARKED, PARKED).paths
+    planned = MotionPlanner(paper_model, MOTION).plan_paths(0, START[:2], PLACE_MM, PARKED, PARKED).paths
     diving = bent(planned, path, joint, math.radians(angle_deg))
     careful.reset(START, 0)
     execution = careful.execute(0, diving)
@@ -191,7 +191,7 @@ def test_a_path_through_the_table_is_refused_when_that_is_looked_for(paper_model
 
 
 def test_a_path_through_the_other_arm_is_refused_when_that_is_looked_for(paper_model):
-    planned = MotionPlanner(paper_model, MOTION).cycle(0, START[:2], PLACE_MM, PARKED, PARKED).paths
+    planned = MotionPlanner(paper_model, MOTION).plan_paths(0, START[:2], PLACE_MM, PARKED, PARKED).paths
     finder = CollisionFinder(paper_model, MOTION)
     assert not finder(0, planned, np.array([PARKED, PARKED]))
     over_the_place = cycle(paper_model, 1, PLACE_MM, PLACE_MM).transfer[0]
@@ -344,6 +344,6 @@ def test_an_agents_direct_cycle_is_carried_out(paper_model):
     backend = started(KinematicBackend, paper_model)
     observation = {"object": START, "target": PLACE_MM, "joints": PARKED, "other_joints": PARKED}
     action = ExecutorAgent(ARM_AGENTS[0], paper_model, "direct").act(observation)
-    execution = backend.execute(0, CyclePaths(*action["paths"].astype(float)))
+    execution = backend.execute(0, PickPlacePaths(*action["paths"].astype(float)))
     assert execution.refusal is None
     np.testing.assert_allclose(execution.pose[:2], PLACE_MM, atol=1e-3)

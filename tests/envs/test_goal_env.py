@@ -16,7 +16,7 @@ import marl_handover
 from marl_handover.config import NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.envs import SupervisorEnv, SupervisorGoalEnv
 from marl_handover.errors import NotFinite, OutOfReach
-from marl_handover.motion.cost import motion_cost
+from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.rules import Outcome
 
 architectures = pytest.mark.parametrize("architecture", ["A", "B"])

@@ -21,8 +21,8 @@ from marl_handover.envs import SupervisorEnv, handover_aec
 from marl_handover.envs.backends import KinematicBackend, Refusal
 from marl_handover.envs.top_view import GOAL
 from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, UnknownKey
-from marl_handover.motion.cost import motion_cost
 from marl_handover.motion.executor import ExecutorAgent
+from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.policies import load
 from marl_handover.runtime.loop import make_loop
 from marl_handover.task.rules import Outcome, Rules

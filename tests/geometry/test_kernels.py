@@ -12,8 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marl_handover.geometry.capsules import segment_distance
-from marl_handover.geometry.kernels import at_wrist, beyond, elbow_up, nearest, pivots, place_capsules, push, turned
-from marl_handover.motion.body import ArmBody, block_capsules, out_of_reach
+from marl_handover.geometry.kernels import (
+    at_wrist,
+    broad_phase,
+    closest_points,
+    elbow_up,
+    forward_kinematics,
+    into_arm_plane,
+    jacobian_transpose,
+    place_capsules,
+)
+from marl_handover.motion.collision_model import CollisionModel, block_capsules, out_of_reach
 
 
 def postures(model, count, seed):
@@ -22,10 +31,10 @@ def postures(model, count, seed):
     return np.random.default_rng(seed).uniform(arm.lower_rad[:4], arm.upper_rad[:4], (count, 4))
 
 
-def placed(body: ArmBody, q):
+def placed(body: CollisionModel, q):
     """Frames and placed capsules of one posture."""
     frames, ends = np.empty((1, 5, 4)), np.empty((len(body.held), 10))
-    pivots(body.planar, q[None], 0, frames, 0)
+    forward_kinematics(body.planar, q[None], 0, frames, 0)
     place_capsules(body.held, frames, 0, ends)
     return frames, ends
 
@@ -39,8 +48,8 @@ def in_base(points, yaw):
 
 def test_the_grip_is_where_forward_kinematics_puts_it(model, planner):
     for q in postures(model, 50, 0):
-        frames, _ = placed(planner.body, q)
-        r, z = at_wrist(frames, 0, *planner.body.planar[6:8])
+        frames, _ = placed(planner.collision_model, q)
+        r, z = at_wrist(frames, 0, *planner.collision_model.planar[6:8])
         expected = model.arm.fk(np.append(q, 0.0))[:3, 3]
         np.testing.assert_allclose(in_base(np.array([r, 0.0, z]), q[0]), expected, atol=1e-9)
 
@@ -48,7 +57,7 @@ def test_the_grip_is_where_forward_kinematics_puts_it(model, planner):
 def test_capsules_enclose_every_shape_of_the_arm(model, planner):
     generator = np.random.default_rng(2)
     for q in postures(model, 10, 1):
-        _, ends = placed(planner.body, q)
+        _, ends = placed(planner.collision_model, q)
         starts, stops = in_base(ends[:, :3], q[0]), in_base(ends[:, 3:6], q[0])
         frames = model.arm.link_transforms(np.append(q, 0.0), planner.motion.finger_travel_mm)
         for link in model.arm.description.links:
@@ -57,7 +66,7 @@ def test_capsules_enclose_every_shape_of_the_arm(model, planner):
                     continue
                 local = generator.uniform(-0.5, 0.5, (30, 3)) * shape.size_mm + shape.xyz_mm
                 world = local @ frames[link.name][:3, :3].T + frames[link.name][:3, 3]
-                gap = segment_distance(starts[:, None], stops[:, None], world[None], world[None]) - planner.body.held[:, None, 7]
+                gap = segment_distance(starts[:, None], stops[:, None], world[None], world[None]) - planner.collision_model.held[:, None, 7]
                 assert (gap.min(axis=0) <= 1e-6).all(), link.name
 
 
@@ -84,16 +93,16 @@ def test_distances_agree_with_the_batched_ones(seed):
     rows[:, 6:9] = (rows[:, :3] + rows[:, 3:6]) / 2
     rows[:, 9] = np.linalg.norm(rows[:, 3:6] - rows[:, :3], axis=1) / 2
     out = np.empty(6)
-    distance = nearest(rows, 0, rows, 1, out)
+    distance = closest_points(rows, 0, rows, 1, out)
     expected = segment_distance(rows[0, :3], rows[0, 3:6], rows[1, :3], rows[1, 3:6])
     assert distance == pytest.approx(float(expected), abs=1e-9)
     assert np.linalg.norm(out[3:]) == pytest.approx(1.0)
     for limit in (0.5 * distance, 0.999 * distance - 1e-9):
-        assert not (beyond(rows, 0, rows, 1, distance + 1e-9) and limit < distance), "what is near must not be skipped"
+        assert not (broad_phase(rows, 0, rows, 1, distance + 1e-9) and limit < distance), "what is near must not be skipped"
 
 
 def test_the_push_of_a_point_is_its_jacobian(model, planner):
-    body, h = planner.body, 1e-6
+    body, h = planner.collision_model, 1e-6
     for q in postures(model, 20, 3):
         frames, ends = placed(body, q)
         generator = np.random.default_rng(4)
@@ -102,7 +111,7 @@ def test_the_push_of_a_point_is_its_jacobian(model, planner):
             world = in_base(ends[k, :3], q[0])
             n_planar = in_base(n, -q[0])
             grad = np.zeros((1, 4))
-            push(frames, 0, int(body.held[k, 0]), *ends[k, :3], *n_planar, 1.0, grad)
+            jacobian_transpose(frames, 0, int(body.held[k, 0]), *ends[k, :3], *n_planar, 1.0, grad)
             for joint in range(4):
                 moved = q.copy()
                 moved[joint] += h
@@ -116,7 +125,7 @@ def test_turning_an_obstacle_keeps_its_distance_to_the_arm(model, planner):
     obstacle = np.array([[*generator.normal(size=6) * 100, 5.0, 5.0, 0.0]])
     for yaw in (0.0, 1.0, -2.5):
         out = np.empty((1, 10))
-        turned(obstacle, 0, np.cos(yaw), np.sin(yaw), out, 0)
+        into_arm_plane(obstacle, 0, np.cos(yaw), np.sin(yaw), out, 0)
         np.testing.assert_allclose(in_base(out[0, :3], yaw), obstacle[0, :3], atol=1e-9)
         np.testing.assert_allclose(in_base(out[0, 3:6], yaw), obstacle[0, 3:6], atol=1e-9)
 
@@ -125,7 +134,7 @@ def test_the_compiled_inverse_kinematics_are_the_cells(model, planner):
     r, z = (grid.ravel() for grid in np.meshgrid(np.linspace(100, 300, 21), np.linspace(40, 160, 13)))
     pitch = np.linspace(-1.0, 1.0, len(r))
     out = np.empty((len(r), 3))
-    elbow_up(planner.body.planar, r, z, pitch, out)
+    elbow_up(planner.collision_model.planar, r, z, pitch, out)
     expected = model.arm.ik(np.stack([r, 0 * r, z], -1), pitch)[:, 0, 1:4]
     difference = np.angle(np.exp(1j * (out - expected)))
     assert (np.isnan(out) == np.isnan(expected)).all()
@@ -133,7 +142,7 @@ def test_the_compiled_inverse_kinematics_are_the_cells(model, planner):
 
 
 def test_pairs_left_out_never_come_near(model, planner):
-    body = planner.body
+    body = planner.collision_model
     kept = {tuple(sorted(pair)) for pair in body.held_pairs.tolist()}
     levels = body.held[:, 0]
     block = len(body.capsules)
@@ -151,7 +160,7 @@ def test_pairs_left_out_never_come_near(model, planner):
 
 
 def test_the_arm_never_reaches_past_its_reach(model, planner):
-    body = planner.body
+    body = planner.collision_model
     for q in postures(model, 500, 7):
         _, ends = placed(body, q)
         for e in (0, 3):
@@ -168,7 +177,7 @@ planner = MotionPlanner(build_cell(cell_config("paper")))
 for pick, place in (([-60.0, 20.0], [50.0, 25.0]), ([0.0, 30.0], [-155.0, 60.0]), ([90.0, -10.0], [-20.0, -15.0])):
     for arm in (0, 1):
         try:
-            motion = planner.cycle(arm, pick, place, planner.parked_rad, planner.parked_rad)
+            motion = planner.pick_place(arm, pick, place, planner.home_rad, planner.home_rad)
         except Exception as refusal:
             print(type(refusal).__name__)
         else:

@@ -39,7 +39,7 @@ def model() -> CellModel:
 def motion(model):
     """A planned transfer of the left arm from the middle of the table, and back again."""
     planner = MotionPlanner(model)
-    return planner.cycle(0, [0.0, 0.0], [30.0, -10.0], PARKED, PARKED)
+    return planner.pick_place(0, [0.0, 0.0], [30.0, -10.0], PARKED, PARKED)
 
 
 def _one_board() -> HardwareConfig:

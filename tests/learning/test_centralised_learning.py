@@ -14,7 +14,7 @@ from marl_handover.learning.centralised_sac import with_actions
 from marl_handover.learning.export import policy_arrays, save_policy
 from marl_handover.learning.trainer import Trainer
 from marl_handover.learning.variants import make_variant
-from marl_handover.motion.ways import mirrored_numbers
+from marl_handover.motion.transfer_features import mirrored_numbers
 from marl_handover.policies import SupervisorPolicy
 from marl_handover.runtime.assessment import AssessmentConfig, assess
 from marl_handover.task.observations import observe

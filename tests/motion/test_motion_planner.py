@@ -15,8 +15,8 @@ from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting, NotFinite, UnknownChoice
 from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
 from marl_handover.motion.executor import ExecutorAgent
+from marl_handover.motion.path_optimizer import NoPath
 from marl_handover.motion.planner import MotionPlanner, string_length
-from marl_handover.motion.segment import NoPath
 from marl_handover.motion.splines import evaluate
 from marl_handover.motion.trajectory import PHASES, OutOfArmsReach
 
@@ -34,13 +34,13 @@ radii, yaws = st.floats(150, 230), st.floats(-np.pi / 2, np.pi / 2)
 @given(st.integers(0, 1), radii, yaws, radii, yaws)
 def test_a_cycle_is_continuous_within_limits_and_clear(model, planner, arm, r1, a1, r2, a2):
     pick, put = place(model, arm, r1, a1), place(model, arm, r2, a2)
-    motion = planner.cycle(arm, pick, put, planner.parked_rad, planner.parked_rad)
+    motion = planner.pick_place(arm, pick, put, planner.home_rad, planner.home_rad)
     assert [phase.name for phase in motion.phases] == [name for name in PHASES if name in {phase.name for phase in motion.phases}]
     joints = np.concatenate([phase.joints_rad for phase in motion.phases])
     times = np.concatenate([phase.t_s for phase in motion.phases])
     assert (np.diff(times) >= 0).all()
     assert np.diff(times).max() <= 0.02 + 1e-9
-    np.testing.assert_allclose(joints[[0, -1]], np.tile(planner.parked_rad, (2, 1)), atol=1e-9)
+    np.testing.assert_allclose(joints[[0, -1]], np.tile(planner.home_rad, (2, 1)), atol=1e-9)
     assert (joints >= model.arm.lower_rad - 1e-9).all()
     assert (joints <= model.arm.upper_rad + 1e-9).all()
     named = {phase.name: phase for phase in motion.phases}
@@ -62,7 +62,7 @@ def test_the_mirrored_arm_moves_alike(model, planner):
     motions = []
     for arm in range(2):
         motions.append(
-            planner.cycle(arm, place(model, arm, 170, 0.7), place(model, arm, 200, -0.5), planner.parked_rad, planner.parked_rad)
+            planner.pick_place(arm, place(model, arm, 170, 0.7), place(model, arm, 200, -0.5), planner.home_rad, planner.home_rad)
         )
     for left, right in zip(motions[0].paths, motions[1].paths, strict=True):
         np.testing.assert_allclose(left, right, atol=1e-6)
@@ -80,9 +80,9 @@ def test_a_path_keeps_clear_of_an_arm_in_its_way(model, planner):
     other = np.append(model.arm.ik([190.0, 0.0, 60.0])[0, :4], 0.0)
     pick, put = place(model, 0, 175, 1.1), place(model, 0, 175, -1.1)
     segment, guesses = planner.carrying(0, pick, put, other)
-    from marl_handover.motion.starts import fitted
+    from marl_handover.motion.initial_guesses import fit_control_points
 
-    plain = evaluate(fitted(list(guesses)[1], segment.body.limits, 9, 5), np.linspace(0, 1, 201), 5)
+    plain = evaluate(fit_control_points(list(guesses)[1], segment.collision_model.limits, 9, 5), np.linspace(0, 1, 201), 5)
     assert segment.check(plain)[0].arm < 0, "the plain way should be blocked, or nothing is tested"
     found = planner.transfer(0, pick, put, other)
     margins, length = segment.check(evaluate(found.points[:, :4], np.linspace(0, 1, 4001), 5))
@@ -112,7 +112,7 @@ def test_the_string_is_a_lower_bound(model, planner):
     generator = np.random.default_rng(3)
     for _ in range(10):
         pick, put = (place(model, 0, *generator.uniform([150, -1.5], [230, 1.5])) for _ in range(2))
-        found = planner.transfer(0, pick, put, planner.parked_rad)
+        found = planner.transfer(0, pick, put, planner.home_rad)
         distance = float(np.linalg.norm(pick - put))
         share = min(1.0, distance / 50)
         bound = string_length(distance, 25.0 * share, 40.0 * share)
@@ -122,16 +122,16 @@ def test_the_string_is_a_lower_bound(model, planner):
 
 def test_putting_it_back_where_it_is_goes_nowhere(model, planner):
     at = place(model, 1, 190, 0.2)
-    motion = planner.cycle(1, at, at, planner.parked_rad, planner.parked_rad)
+    motion = planner.pick_place(1, at, at, planner.home_rad, planner.home_rad)
     assert motion.path_length_mm < 1.0
 
 
 def test_the_papers_method_plans_a_cycle_too(model):
     planner = MotionPlanner(model, MotionConfig(method="paper"))
     pick, put = place(model, 0, 180, 0.4), place(model, 0, 190, -0.3)
-    motion = planner.cycle(0, pick, put, planner.parked_rad, planner.parked_rad)
+    motion = planner.pick_place(0, pick, put, planner.home_rad, planner.home_rad)
     assert len(motion.paths.transfer) == 7
-    best = MotionPlanner(model).transfer(0, pick, put, planner.parked_rad)
+    best = MotionPlanner(model).transfer(0, pick, put, planner.home_rad)
     assert motion.path_length_mm == pytest.approx(best.length_mm, rel=0.05)
     with pytest.raises(InvalidSetting, match="motion.method"):
         ExecutorAgent("arm_left", model, motion=MotionConfig(method="paper"))
@@ -140,7 +140,7 @@ def test_the_papers_method_plans_a_cycle_too(model):
 def test_an_approach_comes_down_on_the_pin(model, planner):
     """Beside the pin, at the fingers' inner width and less, the fingertips are above its top."""
     pick = place(model, 0, 160, 0.9)
-    found = planner.reach(0, planner.parked_rad, pick, planner.parked_rad, leaving=False)
+    found = planner.reach(0, planner.home_rad, pick, planner.home_rad, leaving=False)
     T = model.arm.fk(evaluate(found.points, np.linspace(0, 1, 501), 5))
     away = np.linalg.norm(T[:, :2, 3] - planner.in_base(0, pick), axis=1)
     beside = (away > 10) & (away < 25)
@@ -162,11 +162,11 @@ def test_an_approach_comes_down_on_the_pin(model, planner):
 )
 def test_bad_commands_are_named(model, planner, changes, error, text):
     command = {
-        "arm": 0, "pick_mm": place(model, 0, 190, 0.3), "place_mm": place(model, 0, 170, -0.3), "joints_rad": planner.parked_rad,
-        "other_joints_rad": planner.parked_rad,
+        "arm": 0, "pick_mm": place(model, 0, 190, 0.3), "place_mm": place(model, 0, 170, -0.3), "joints_rad": planner.home_rad,
+        "other_joints_rad": planner.home_rad,
     }  # fmt: skip
     with pytest.raises(error, match=text):
-        planner.cycle(**{**command, **changes})
+        planner.pick_place(**{**command, **changes})
 
 
 @pytest.mark.parametrize(
@@ -198,5 +198,5 @@ def test_the_other_shipped_cell_moves_too():
     for _ in range(5):
         low, high = [model.cell.r_min_mm, model.cell.yaw_rad[0]], [model.cell.r_max_mm, model.cell.yaw_rad[1]]
         pick, put = (place(model, 1, *generator.uniform(low, high)) for _ in range(2))
-        motion = planner.cycle(1, pick, put, planner.parked_rad, planner.parked_rad)
+        motion = planner.pick_place(1, pick, put, planner.home_rad, planner.home_rad)
         assert motion.min_clearance_mm >= planner.motion.arm_clearance_mm

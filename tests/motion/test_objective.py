@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from marl_handover.geometry.capsules import segment_distance
-from marl_handover.motion.objective import Price, columns, lagrangian, ramp
-from marl_handover.motion.segment import WEIGHTS
+from marl_handover.motion.initial_guesses import fit_control_points
+from marl_handover.motion.objective import Penalty, columns, lagrangian, ramp
+from marl_handover.motion.path_optimizer import WEIGHTS
 from marl_handover.motion.splines import evaluate
-from marl_handover.motion.starts import fitted
 from tests.geometry.test_kernels import placed
 
 OTHER = np.array([0.3, 1.0, -2.2, 1.2, 0.0])
@@ -23,9 +23,9 @@ def case(request, planner):
         segment, guesses = planner.carrying(0, pick, place, OTHER)
         guess = next(guesses)
     else:
-        segment, guesses = planner.reaching(0, planner.parked_rad, pick, OTHER, leaving=request.param == "leaving")
+        segment, guesses = planner.reaching(0, planner.home_rad, pick, OTHER, leaving=request.param == "leaving")
         guess = next(guesses)
-    points = fitted(guess, segment.body.limits, 9, 5)
+    points = fit_control_points(guess, segment.collision_model.limits, 9, 5)
     points[1:-1] += np.random.default_rng(0).normal(size=(7, 4)) * 0.4
     return segment, evaluate(points, np.linspace(0, 1, 21), 5)
 
@@ -33,7 +33,7 @@ def case(request, planner):
 def priced(segment, samples, seed=None):
     shape = (len(samples), columns(segment.scene))
     lam = np.zeros(shape) if seed is None else np.random.default_rng(seed).uniform(0, 3, shape)
-    return Price(lam, 0.7, np.full(len(samples) - 1, 1 / (len(samples) - 1)), WEIGHTS)
+    return Penalty(lam, 0.7, np.full(len(samples) - 1, 1 / (len(samples) - 1)), WEIGHTS)
 
 
 @pytest.mark.parametrize("seed", [None, 1])
@@ -62,7 +62,7 @@ def test_the_dense_check_is_the_brute_force_minimum(case):
     arm, block, itself, ground = [], [], [], []
     grips = []
     for q in Q:
-        frames, everything = placed(segment.body, q)
+        frames, everything = placed(segment.collision_model, q)
         ends = everything[: len(scene.capsules)]
         c, s = np.cos(q[0]), np.sin(q[0])
         turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])

@@ -10,7 +10,7 @@ import numpy as np
 from marl_handover import policies
 from marl_handover.geometry.capsules import capsule_pairs, segment_distance
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.motion.body import block_capsules
+from marl_handover.motion.collision_model import block_capsules
 from marl_handover.runtime.interactive.cell import InteractiveCell, Snapshot
 
 DT_S = 0.02

@@ -313,7 +313,7 @@ def test_what_the_gate_refuses_is_not_sent_and_the_arm_goes_home(start):
     assert not episode.solved
     assert lab.counts[Event.GATE_REFUSED] >= 1
     assert math.dist(lab.twin.true_pose()[:2], START[:2]) < 1.0
-    assert np.degrees(np.abs(lab.twin.true_joints_rad() - lab.session.backend.check.parked_rad)).max() < 6.0
+    assert np.degrees(np.abs(lab.twin.true_joints_rad() - lab.session.backend.check.home_rad)).max() < 6.0
 
 
 def test_the_latched_stop_ends_the_session_where_it_is(start, tmp_path):

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marl_handover.motion.splines import evaluate
-from marl_handover.motion.timing import time_path
-from marl_handover.runtime.interactive.tracks import DELAYS, STEP_S, Track, joined, still, stopped
+from marl_handover.motion.time_parametrization import time_path
+from marl_handover.motion.trajectory import JointTrajectory, still
+from marl_handover.runtime.interactive.tracks import DELAYS, STEP_S, joined, stopped
 
 VELOCITY = np.array([4.6, 3.6, 3.6, 4.2, 7.6])
 ACCELERATION = np.full(5, 14.0)
@@ -23,7 +24,7 @@ def track_of(seed, start=None):
     points = np.cumsum(random.normal(0, 0.4, (11, 5)), axis=0)
     points += 0 if start is None else start - points[0]
     done = time_path(points, 5, VELOCITY, ACCELERATION, STEP_S)
-    return Track(done.t_s, done.joints_rad, done.velocities_rad_s), points
+    return JointTrajectory(done.t_s, done.joints_rad, done.velocities_rad_s), points
 
 
 def bends(track, step_s=0.01):
@@ -63,7 +64,7 @@ def test_a_stop_keeps_to_the_way_and_the_limits(seed, share):
     (joints, rates), (first, rate) = stop.at(np.linspace(0, stop.duration_s, 200)), track.at(begun)
     assert np.allclose(joints[0], first, atol=1e-9)
     assert np.allclose(rates[0], rate, atol=1e-6)
-    assert not stop.rates_rad_s[-1].any()
+    assert not stop.velocities_rad_s[-1].any()
     assert stop.duration_s <= track.duration_s - begun + STEP_S
     way = evaluate(points, np.linspace(0.0, 1.0, 20001), 5)
     assert max(abs(way - q).max(axis=1).min() for q in joints[::10]) < 1e-3
@@ -76,7 +77,7 @@ def test_a_stop_is_as_short_as_one_joint_allows():
     points = np.zeros((11, 5))
     points[:, 0] = np.linspace(0.0, 6.0, 11)
     done = time_path(points, 5, VELOCITY, ACCELERATION, STEP_S)
-    track = Track(done.t_s, done.joints_rad, done.velocities_rad_s)
+    track = JointTrajectory(done.t_s, done.joints_rad, done.velocities_rad_s)
     stop = stopped(track, track.duration_s / 2, ACCELERATION)
     assert stop.duration_s == pytest.approx(VELOCITY[0] / ACCELERATION[0], rel=0.05)
 
@@ -101,10 +102,10 @@ def test_who_goes_on_the_same_way_does_not_stop_and_who_must_not_touch_anything_
     points = np.zeros((11, 5))
     points[:, 0] = np.linspace(0.0, 3.0, 11)
     done = time_path(points, 5, VELOCITY, ACCELERATION, STEP_S)
-    track = Track(done.t_s, done.joints_rad, done.velocities_rad_s)
+    track = JointTrajectory(done.t_s, done.joints_rad, done.velocities_rad_s)
     stop = stopped(track, 0.2, ACCELERATION)
     further = time_path(points + stop.end_rad, 5, VELOCITY, ACCELERATION, STEP_S)
-    onward = Track(further.t_s, further.joints_rad, further.velocities_rad_s)
+    onward = JointTrajectory(further.t_s, further.joints_rad, further.velocities_rad_s)
     free = joined(stop, onward, VELOCITY, ACCELERATION, lambda joints: True)
     assert free.duration_s == pytest.approx(DELAYS[0] * stop.duration_s + onward.duration_s)
     asked = []

@@ -15,7 +15,7 @@ from marl_handover.envs.cycle_check import END_TOLERANCE_MM, Refusal
 from marl_handover.errors import InvalidSetting, UnknownChoice
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.learning.rollout import play
-from marl_handover.motion.cost import cache_file, cost_table, settings_key
+from marl_handover.motion.path_length_table import cache_file, path_length_table, settings_key
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.runtime.loop import ClosedLoop, make_loop
 from marl_handover.task.rules import Outcome, Rules
@@ -408,9 +408,9 @@ def test_the_other_arm_is_avoided_where_it_is_measured(planner):
     told = []
 
     class Asked(MotionPlanner):
-        def cycle(self, arm, pick_mm, place_mm, joints_rad, other_joints_rad):
+        def plan_paths(self, arm, pick_mm, place_mm, joints_rad, other_joints_rad):
             told.append((np.array(joints_rad), np.array(other_joints_rad)))
-            return super().cycle(arm, pick_mm, place_mm, joints_rad, other_joints_rad)
+            return super().plan_paths(arm, pick_mm, place_mm, joints_rad, other_joints_rad)
 
     backend = Drooping(planner.model, MOTION, noise=EXACT, missed_grasps=0.0)
     backend.droop = np.full((2, 5), 0.01)
@@ -424,7 +424,7 @@ def test_transfers_are_priced_as_these_arms_move(planner, tmp_path, monkeypatch)
     """A table made for other motion settings, kept where the package looks for it, with prices that no real path has."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     motion, cell = MotionConfig(lift_mm=31.0), planner.model.cell
-    usual = cost_table(cell, MotionConfig())
+    usual = path_length_table(cell, MotionConfig())
     table = replace(usual, key=settings_key(cell, motion), string_mm=0 * usual.string_mm + 700.0, excess_mm=0 * usual.excess_mm)
     cache_file(table.key).parent.mkdir()
     table.save(cache_file(table.key))

@@ -12,8 +12,8 @@ from marl_handover.envs.centralised import CentralisedRules
 from marl_handover.envs.cycle_check import CycleCheck
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.learning.rollout import Decision, play
-from marl_handover.motion.batched_points import ends_of
-from marl_handover.motion.cost import known_table
+from marl_handover.motion.batched_paths import ends_of
+from marl_handover.motion.path_length_table import known_table
 from marl_handover.policies import load
 from marl_handover.runtime.assessment import AssessmentConfig, assess
 from marl_handover.runtime.paths import PathLengths

@@ -30,7 +30,7 @@ def test_planned_transfers_succeed_one_after_the_other(backend, planner, motion,
     pose = backend.reset(np.array([30.0, -15.0, 0.3]), 0)
     for arm, place in ((0, (-70.0, 10.0)), (1, (60.0, -30.0))):
         joints = backend.joints_rad()[arm] * (1, 1, 1, 1, 0)
-        plan = planner.cycle(arm, pose[:2], place, joints, parked)
+        plan = planner.pick_place(arm, pose[:2], place, joints, parked)
         done = backend.execute(arm, plan.paths)
         wanted = expected(arm, pose, place)
         assert done.refusal is None
@@ -44,7 +44,7 @@ def test_planned_transfers_succeed_one_after_the_other(backend, planner, motion,
 def test_senseless_cycles_are_refused_and_nothing_moves(backend, planner, motion):
     parked = np.radians(motion.parked_deg)
     pose = backend.reset(np.array([30.0, -15.0, 0.3]), 0)
-    paths = planner.cycle(0, (40.0, -15.0), (-70.0, 10.0), parked, parked).paths
+    paths = planner.pick_place(0, (40.0, -15.0), (-70.0, 10.0), parked, parked).paths
     assert backend.execute(0, paths).refusal == Refusal.OBJECT_ELSEWHERE
     broken = paths._replace(transfer=np.full_like(paths.transfer, np.nan))
     assert backend.execute(0, broken).refusal == Refusal.NOT_FINITE
@@ -73,7 +73,7 @@ def test_a_cycle_that_is_nearly_joined_is_carried_out(backend, planner, motion):
     """Within what the check lets pass; the timing takes no gap."""
     parked = np.radians(motion.parked_deg)
     pose = backend.reset(np.array([30.0, -15.0, 0.3]), 0)
-    paths = planner.cycle(0, pose[:2], (-70.0, 10.0), parked, parked).paths
+    paths = planner.pick_place(0, pose[:2], (-70.0, 10.0), parked, parked).paths
     for later in paths[1:]:
         later[0, 0] += 5e-5
     done = backend.execute(0, paths)

@@ -17,11 +17,11 @@ END_MM = np.array([-40.0, -15.0])
 @pytest.fixture(scope="module")
 def played(model):
     planner = MotionPlanner(model, MotionConfig())
-    motion = planner.cycle(0, START[:2], END_MM, planner.parked_rad, planner.parked_rad)
+    motion = planner.pick_place(0, START[:2], END_MM, planner.home_rad, planner.home_rad)
     t_s = np.concatenate([phase.t_s for phase in motion.phases])
     joints = np.concatenate([phase.joints_rad for phase in motion.phases])
     fingers = np.concatenate([phase.gripper_mm for phase in motion.phases])
-    parked, wide = planner.parked_rad, MotionConfig().finger_travel_mm
+    parked, wide = planner.home_rad, MotionConfig().finger_travel_mm
 
     def servos(now_s):
         own = np.array([np.interp(now_s, t_s, column) for column in joints.T])

@@ -40,7 +40,7 @@ def test_a_planned_transfer_carries_the_block_with_the_hand_from_where_it_was_to
     assert not motion.grip_open[:-1][moving].all(axis=-1).any()  # nothing moves but in a closed hand
     assert (seconds >= 0).all()
     assert motion.T_world_block[:, 2, 3].max() > 10.0  # over the table
-    np.testing.assert_array_equal(motion.joints_rad[:, 1], np.tile(motions.planner.parked_rad, (len(motion.t_s), 1)))
+    np.testing.assert_array_equal(motion.joints_rad[:, 1], np.tile(motions.planner.home_rad, (len(motion.t_s), 1)))
 
 
 def test_the_sample_of_a_time_is_the_last_one_before(motions, step):
@@ -91,9 +91,9 @@ def test_a_place_holds_the_arm_that_put_the_block_there(model, motions, step):
     cos, sin = base.facing
     world = np.array([[cos, -sin], [sin, cos]]) @ grip[:2] + (base.x_mm, base.y_mm)
     np.testing.assert_allclose(world, PLACE, atol=1e-6)
-    np.testing.assert_array_equal(joints[1], motions.planner.parked_rad)
+    np.testing.assert_array_equal(joints[1], motions.planner.home_rad)
     for other in (step._replace(next_state=np.array([900.0, 0.0, 0.0])), step._replace(trouble="dropped")):
-        np.testing.assert_array_equal(motions.placed(other), np.tile(motions.planner.parked_rad, (2, 1)))
+        np.testing.assert_array_equal(motions.placed(other), np.tile(motions.planner.home_rad, (2, 1)))
 
 
 def test_a_block_that_was_dropped_stays_in_sight_and_ends_where_it_fell(motions, step):

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
 from marl_handover.geometry.se3 import transform
-from marl_handover.motion.cycle import LIFTED_MM
-from marl_handover.runtime.interactive.tracks import Track
+from marl_handover.motion.pick_place import LIFTED_MM
+from marl_handover.motion.trajectory import JointTrajectory
 
 Floats = NDArray[np.float64]
 
@@ -31,8 +31,8 @@ class Piece(NamedTuple):
     arm: int
     open_from: float
     open_to: float
-    track: Track | None
-    way: Callable[[], Track] | None = None
+    track: JointTrajectory | None
+    way: Callable[[], JointTrajectory] | None = None
 
 
 class Body:
@@ -47,9 +47,9 @@ class Body:
         clock_s: time in its first piece.
     """
 
-    def __init__(self, model: CellModel, parked_rad: Floats, pose: Floats) -> None:
+    def __init__(self, model: CellModel, home_rad: Floats, pose: Floats) -> None:
         self.model = model
-        self.joints_rad = np.tile(parked_rad, (model.cell.num_arms, 1))
+        self.joints_rad = np.tile(home_rad, (model.cell.num_arms, 1))
         self.opened = np.ones(model.cell.num_arms)
         self.pose = np.array(pose, float)
         self.held = False

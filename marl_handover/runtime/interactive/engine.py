@@ -49,7 +49,7 @@ class Engine:
 
     def __init__(self, decider: Decider, model: CellModel, planner: MotionPlanner, seed: int) -> None:
         self.decider, self.programs = decider, Programs(FreePaths(planner))
-        self.body, self.score = Body(model, planner.parked_rad, np.zeros(3)), Score()
+        self.body, self.score = Body(model, planner.home_rad, np.zeros(3)), Score()
         self.goal, self.ended, self.message = np.zeros(3), "", ""
         self.plan: tuple[Placement, ...] = ()
         self.transfers, self.optimal = 0, 0

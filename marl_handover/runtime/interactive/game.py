@@ -12,7 +12,7 @@ from marl_handover.cell.build import CellModel
 from marl_handover.config import LoopConfig, MotionConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.learning.rollout import nobody_moves
-from marl_handover.motion.cost import motion_cost
+from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.policies import SupervisorPolicy
 from marl_handover.runtime.episode import Order, finishing, moved, ordered
 from marl_handover.runtime.foresight import Placement

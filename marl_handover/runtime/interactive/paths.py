@@ -12,13 +12,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.motion.body import ball_around, standing_block
-from marl_handover.motion.cycle import motion_limits
+from marl_handover.motion.collision_model import ball_around, standing_block
+from marl_handover.motion.initial_guesses import GRIP_LEAST_MM, SAMPLES, carrying_guesses, reaching_guesses
+from marl_handover.motion.path_optimizer import FoundPath, Segment, find_path
+from marl_handover.motion.pick_place import motion_limits
 from marl_handover.motion.planner import STILL_MM, MotionPlanner, detour_length, string_length
-from marl_handover.motion.segment import FoundPath, Segment, find_path
-from marl_handover.motion.starts import GRIP_LEAST_MM, SAMPLES, carrying_starts, reaching_starts
-from marl_handover.motion.timing import time_path
-from marl_handover.runtime.interactive.tracks import STEP_S, Track, still
+from marl_handover.motion.time_parametrization import time_path
+from marl_handover.motion.trajectory import JointTrajectory, still
+from marl_handover.runtime.interactive.tracks import STEP_S
 
 Floats = NDArray[np.float64]
 
@@ -41,52 +42,52 @@ class FreePaths:
     """
 
     def __init__(self, planner: MotionPlanner) -> None:
-        self.planner, self.motion, self.body = planner, planner.motion, planner.body
+        self.planner, self.motion, self.collision_model = planner, planner.motion, planner.collision_model
         model = planner.model
-        self.parked_rad = planner.parked_rad
+        self.home_rad = planner.home_rad
         self.planned = 0
         self.velocity_rad_s, self.acceleration_rad_s2 = motion_limits(model.arm, self.motion)
         middle = (model.cell.r_min_mm + model.cell.r_max_mm) / 2
         self._empty, self._loaded = [], []
         for arm, base in enumerate(model.cell.bases):
             ahead = base.to_world([middle, 0.0])
-            self._empty.append(planner.reaching(arm, self.parked_rad, ahead, self.parked_rad, leaving=True)[0])
-            self._loaded.append(planner.carrying(arm, ahead, ahead, self.parked_rad)[0])
+            self._empty.append(planner.reaching(arm, self.home_rad, ahead, self.home_rad, leaving=True)[0])
+            self._loaded.append(planner.carrying(arm, ahead, ahead, self.home_rad)[0])
 
     def parked(self, joints_rad: Floats) -> bool:
         """Whether an arm at ``joints_rad`` (5,) is parked."""
-        return self._same(joints_rad, self.parked_rad)
+        return self._same(joints_rad, self.home_rad)
 
-    def to_pin(self, arm: int, joints_rad: Floats, pin_mm: Floats) -> Track:
+    def to_pin(self, arm: int, joints_rad: Floats, pin_mm: Floats) -> JointTrajectory:
         """The empty hand from ``joints_rad`` (5,) to the pin of a block lying at ``pin_mm`` (2,). Raises as ``MotionPlanner.cycle``."""
         if self.parked(joints_rad):
-            return self.timed(self.planner.reach(arm, joints_rad, pin_mm, self.parked_rad, leaving=False))
+            return self.timed(self.planner.reach(arm, joints_rad, pin_mm, self.home_rad, leaving=False))
         end = self.planner.grasp_joints(arm, "pick up", pin_mm)
         pin, scale = self.planner.in_base(arm, pin_mm), self.motion.approach_scale_mm
         profile = self._profile(joints_rad, pin, scale, self.motion.lift_mm, self.motion.ground_clearance_mm)
         ends = np.stack([joints_rad, end])[:, :4]
         segment = self._eased(self._around_block(arm, pin_mm, ends, profile))
-        guesses = reaching_starts(self.body, ends, np.array([*pin, self.planner.pick_height_mm]), self.motion.lift_mm, True)
+        guesses = reaching_guesses(self.collision_model, ends, np.array([*pin, self.planner.pick_height_mm]), self.motion.lift_mm, True)
         return self.timed(self._found(segment, self._chained(self._hops(ends), guesses), wanted=1))
 
-    def home(self, arm: int, joints_rad: Floats, block_mm: Floats) -> Track:
+    def home(self, arm: int, joints_rad: Floats, block_mm: Floats) -> JointTrajectory:
         """The empty hand from ``joints_rad`` (5,) to the parked pose, past a block lying at ``block_mm`` (2,)."""
         if self.parked(joints_rad):
-            return still(self.parked_rad, STEP_S)
-        ends = np.stack([joints_rad, self.parked_rad])[:, :4]
+            return still(self.home_rad, STEP_S)
+        ends = np.stack([joints_rad, self.home_rad])[:, :4]
         profile = self._profile(joints_rad, np.zeros(2), self.motion.approach_scale_mm, 0.0, self.motion.ground_clearance_mm)
         segment = self._eased(self._around_block(arm, block_mm, ends, profile))
         return self.timed(self._found(segment, self._hops(ends), wanted=1))
 
-    def from_pin(self, arm: int, pin_mm: Floats) -> Track:
+    def from_pin(self, arm: int, pin_mm: Floats) -> JointTrajectory:
         """The opened hand from the pin at ``pin_mm`` (2,) to the parked pose."""
-        return self.timed(self.planner.reach(arm, self.parked_rad, pin_mm, self.parked_rad, leaving=True))
+        return self.timed(self.planner.reach(arm, self.home_rad, pin_mm, self.home_rad, leaving=True))
 
-    def carry(self, arm: int, pick_mm: Floats, place_mm: Floats) -> Track:
+    def carry(self, arm: int, pick_mm: Floats, place_mm: Floats) -> JointTrajectory:
         """The hand with the block from where it lay to where it is to lie, both (2,)."""
-        return self.timed(self.planner.transfer(arm, pick_mm, place_mm, self.parked_rad))
+        return self.timed(self.planner.transfer(arm, pick_mm, place_mm, self.home_rad))
 
-    def carry_on(self, arm: int, joints_rad: Floats, place_mm: Floats) -> Track:
+    def carry_on(self, arm: int, joints_rad: Floats, place_mm: Floats) -> JointTrajectory:
         """The hand with the block from ``joints_rad`` (5,) in mid-air to ``place_mm`` (2,)."""
         planner, motion = self.planner, self.motion
         ends = np.stack([joints_rad, planner.grasp_joints(arm, "place", place_mm)])[:, :4]
@@ -101,7 +102,7 @@ class FreePaths:
         bound = string_length(distance, scale, lift_mm)
         expected = bound + detour_length(ends_mm, GRIP_LEAST_MM)
         segment = replace(loaded, ends=ends, scene=loaded.scene._replace(profile=profile), lower_bound_mm=distance, expected_mm=expected)
-        guesses = carrying_starts(self.body, ends, ends_mm, planner.pick_height_mm, lift_mm)
+        guesses = carrying_guesses(self.collision_model, ends, ends_mm, planner.pick_height_mm, lift_mm)
         return self.timed(self._found(self._eased(segment), self._chained(guesses, self._hops(ends))))
 
     def clear_of_block(self, arm: int, joints_rad: Floats, block_mm: Floats) -> bool:
@@ -124,11 +125,10 @@ class FreePaths:
         margins, _ = segment.check(joints_rad[:, :4])
         return min(margins.arm, margins.block, margins.itself, margins.ground, margins.edge) >= 0.0
 
-    def timed(self, found: FoundPath) -> Track:
+    def timed(self, found: FoundPath) -> JointTrajectory:
         """A path with its time law."""
         self.planned += 1
-        done = time_path(found.points, self.motion.degree, self.velocity_rad_s, self.acceleration_rad_s2, STEP_S)
-        return Track(done.t_s, done.joints_rad, done.velocities_rad_s)
+        return time_path(found.points, self.motion.degree, self.velocity_rad_s, self.acceleration_rad_s2, STEP_S)
 
     def _found(self, segment: Segment, guesses: Iterator[Floats], wanted: int = 2) -> FoundPath:
         return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.starts, wanted=wanted)
@@ -168,7 +168,7 @@ class FreePaths:
         yield line
         for share in (0.4, 0.9):
             path = line.copy()
-            path[:, 1:] += share * (self.parked_rad[1:4] - path[:, 1:]) * np.sin(math.pi * t) ** 0.5
+            path[:, 1:] += share * (self.home_rad[1:4] - path[:, 1:]) * np.sin(math.pi * t) ** 0.5
             path[0], path[-1] = ends
             yield path
 

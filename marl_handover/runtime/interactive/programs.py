@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.errors import WorkFailed
+from marl_handover.motion.trajectory import JointTrajectory, still
 from marl_handover.runtime.episode import Order
 from marl_handover.runtime.interactive.body import Body, Piece
 from marl_handover.runtime.interactive.paths import FreePaths
-from marl_handover.runtime.interactive.tracks import STEP_S, Track, joined, still, stopped
+from marl_handover.runtime.interactive.tracks import STEP_S, joined, stopped
 
 Floats = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ class Programs:
     def cycle(self, order: Order, pose: Floats) -> list[Piece]:
         """The whole transfer of a block lying at ``pose`` (3,), all arms being parked."""
         arm, pin = order.arm, pose[:2].copy()
-        approach = Piece("approach", arm, 1.0, 1.0, None, lambda: self.paths.to_pin(arm, self.paths.parked_rad, pin))
+        approach = Piece("approach", arm, 1.0, 1.0, None, lambda: self.paths.to_pin(arm, self.paths.home_rad, pin))
         return [approach, *self._from_grasp(order, pose)]
 
     def home(self, arm: int, joints_rad: Floats, pose: Floats) -> Piece:
@@ -70,7 +71,7 @@ class Programs:
         carry = self._joined(piece.arm, stop, onward, None)
         return [Piece("carry", piece.arm, 0.0, 0.0, carry), *self._from_carry(order, body.pose)[1:]]
 
-    def stop(self, body: Body) -> Track:
+    def stop(self, body: Body) -> JointTrajectory:
         """The quickest stop of what is under way."""
         piece = body.program[0]
         if piece.track is None:
@@ -84,7 +85,7 @@ class Programs:
         onward = ways[kind](piece.arm, stop.end_rad, block)
         return Piece(kind, piece.arm, float(body.opened[piece.arm]), 1.0, self._joined(piece.arm, stop, onward, block))
 
-    def _joined(self, arm: int, stop: Track, onward: Track, block_mm: Floats | None) -> Track:
+    def _joined(self, arm: int, stop: JointTrajectory, onward: JointTrajectory, block_mm: Floats | None) -> JointTrajectory:
         limits = self.paths.velocity_rad_s, self.paths.acceleration_rad_s2
         return joined(stop, onward, *limits, lambda joints: self.paths.allows(arm, joints, block_mm))
 

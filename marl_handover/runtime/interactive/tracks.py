@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from marl_handover.motion.trajectory import JointTrajectory, still
 
 Floats = NDArray[np.float64]
 
@@ -27,54 +28,7 @@ DELAYS = (0.0, 0.25, 0.5, 0.75)
 """Parts of a stop after which the next motion may set out."""
 
 
-@dataclass(frozen=True)
-class Track:
-    """A motion of one arm: times ``t_s`` (n,) from 0, ``joints_rad`` (n, 5) and their rates ``rates_rad_s`` (n, 5); at rest at its end."""
-
-    t_s: Floats
-    joints_rad: Floats
-    rates_rad_s: Floats
-
-    @property
-    def duration_s(self) -> float:
-        """How long it takes."""
-        return float(self.t_s[-1])
-
-    @property
-    def end_rad(self) -> Floats:
-        """Joints (5,) at its end."""
-        return np.asarray(self.joints_rad[-1])
-
-    def at(self, t_s: Floats | float) -> tuple[Floats, Floats]:
-        """Joints and rates (..., 5) at times (...); before its beginning and after its end it rests there."""
-        t = np.asarray(t_s, float)
-        i = np.clip(np.searchsorted(self.t_s, t, side="right") - 1, 0, len(self.t_s) - 2)
-        h = (self.t_s[i + 1] - self.t_s[i])[..., None]
-        z = np.clip((t - self.t_s[i])[..., None] / h, 0.0, 1.0)
-        p, q, v, w = self.joints_rad[i], self.joints_rad[i + 1], h * self.rates_rad_s[i], h * self.rates_rad_s[i + 1]
-        bend, twist = 3 * (q - p) - 2 * v - w, 2 * (p - q) + v + w
-        rates = (v + z * (2 * bend + 3 * z * twist)) / h
-        inside = ((t >= 0.0) & (t <= self.t_s[-1]))[..., None]
-        return p + z * (v + z * (bend + z * twist)), np.where(inside, rates, 0.0)
-
-    def rest(self, t_s: float) -> Track:
-        """What is left of it from ``t_s`` on."""
-        if t_s <= 0.0:
-            return self
-        if t_s >= self.duration_s:
-            return still(self.end_rad, STEP_S)
-        joints, rates = self.at(t_s)
-        after = int(np.searchsorted(self.t_s, t_s + 1e-9))
-        t = np.concatenate([[0.0], self.t_s[after:] - t_s])
-        return Track(t, np.concatenate([joints[None], self.joints_rad[after:]]), np.concatenate([rates[None], self.rates_rad_s[after:]]))
-
-
-def still(joints_rad: Floats, duration_s: float) -> Track:
-    """An arm that holds ``joints_rad`` (5,)."""
-    return Track(np.array([0.0, duration_s]), np.stack([joints_rad, joints_rad]), np.zeros((2, len(joints_rad))))
-
-
-def stopped(track: Track, t_s: float, acceleration_rad_s2: Floats) -> Track:
+def stopped(track: JointTrajectory, t_s: float, acceleration_rad_s2: Floats) -> JointTrajectory:
     """The quickest stop along the way of ``track`` from time ``t_s`` on.
 
     It is the same way with another clock s(t): a joint's acceleration is q'' s'^2 + q' s''. As s' is at most 1, to let it be is always
@@ -112,7 +66,7 @@ def stopped(track: Track, t_s: float, acceleration_rad_s2: Floats) -> Track:
     joints, rates = track.at(np.minimum(place[i] + since * (speed[i] + since * change / 2), place[-1]))
     rates = rates * (speed[i] + since * change)[:, None]
     rates[-1] = 0.0
-    return Track(t, joints, rates)
+    return JointTrajectory(t, joints, rates)
 
 
 def _even(duration_s: float) -> Floats:
@@ -120,7 +74,9 @@ def _even(duration_s: float) -> Floats:
     return np.linspace(0.0, duration_s, 1 + max(1, math.ceil(duration_s / STEP_S - 1e-9)))
 
 
-def joined(first: Track, second: Track, velocity_rad_s: Floats, acceleration_rad_s2: Floats, allowed: Callable[[Floats], bool]) -> Track:
+def joined(
+    first: JointTrajectory, second: JointTrajectory, velocity_rad_s: Floats, acceleration_rad_s2: Floats, allowed: Callable[[Floats], bool]
+) -> JointTrajectory:
     """A stop and the motion from there as one, the second setting out before the first has ended if it can.
 
     While both are under way they are added up: where one slows down and the other speeds up alike, the arm goes on without slowing down.
@@ -144,7 +100,7 @@ def joined(first: Track, second: Track, velocity_rad_s: Floats, acceleration_rad
         if (abs(rates[both]) > EXCESS * velocity_rad_s).any() or (abs(bends) > EXCESS * acceleration_rad_s2).any():
             continue
         if allowed(joints[both]):
-            return Track(t, joints, rates)
+            return JointTrajectory(t, joints, rates)
     t = np.concatenate([first.t_s, first.duration_s + second.t_s[1:]])
     joints = np.concatenate([first.joints_rad, second.joints_rad[1:]])
-    return Track(t, joints, np.concatenate([first.rates_rad_s, second.rates_rad_s[1:]]))
+    return JointTrajectory(t, joints, np.concatenate([first.velocities_rad_s, second.velocities_rad_s[1:]]))

@@ -16,9 +16,9 @@ from marl_handover.cell.build import build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.motion.cycle import LIFTED_MM, timed_phases
+from marl_handover.motion.pick_place import LIFTED_MM, timed_phases
 from marl_handover.motion.splines import basis
-from marl_handover.motion.trajectory import PHASES, CyclePaths, Phase
+from marl_handover.motion.trajectory import PHASES, Phase, PickPlacePaths
 
 Floats = NDArray[np.float64]
 
@@ -29,23 +29,23 @@ VELOCITY = MOTION.velocity_share * np.array([ARM.description.joint(name).velocit
 ACCELERATION = math.radians(MOTION.acceleration_deg_s2)
 
 
-def fitted(samples):
+def fit_control_points(samples):
     """Control points near joint samples at even tau, the ends exact."""
     B = basis(np.linspace(0, 1, len(samples)), MOTION.control_points, MOTION.degree)
     ends = np.outer(B[:, 0], samples[0]) + np.outer(B[:, -1], samples[-1])
     return np.concatenate([samples[:1], np.linalg.lstsq(B[:, 1:-1], samples - ends)[0], samples[-1:]])
 
 
-def cycle_paths(yaws_rad: tuple[float, float], radii_mm: tuple[float, float], lift_mm: float = 40.0) -> CyclePaths:
+def cycle_paths(yaws_rad: tuple[float, float], radii_mm: tuple[float, float], lift_mm: float = 40.0) -> PickPlacePaths:
     """A cycle of an arm alone: over the table in an arc, straight in joints to and from the parked pose."""
     part = np.linspace(0.0, 1.0, 60)
     yaw, radius = (low + (high - low) * part for low, high in (yaws_rad, radii_mm))
     height = PICK_MM + lift_mm * np.sin(math.pi * part)
     grip = np.stack([radius * np.cos(yaw), radius * np.sin(yaw), height], axis=1)
-    transfer = fitted(ARM.ik(grip)[:, 0])
+    transfer = fit_control_points(ARM.ik(grip)[:, 0])
     parked = np.radians(MOTION.parked_deg)
     way = np.linspace(0.0, 1.0, MOTION.control_points)[:, None]
-    return CyclePaths(parked + way * (transfer[0] - parked), transfer, transfer[-1] + way * (parked - transfer[-1]))
+    return PickPlacePaths(parked + way * (transfer[0] - parked), transfer, transfer[-1] + way * (parked - transfer[-1]))
 
 
 def joined(phases: tuple[Phase, ...]) -> tuple[Floats, Floats, Floats]:

@@ -16,7 +16,8 @@ from toppra import constraint
 
 from marl_handover.errors import InvalidSetting, NotFinite
 from marl_handover.motion.splines import evaluate, knots
-from marl_handover.motion.timing import TimedPath, time_path
+from marl_handover.motion.time_parametrization import time_path
+from marl_handover.motion.trajectory import JointTrajectory
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +50,7 @@ def random_path(kind: str, seed: int) -> Floats:
     return points
 
 
-def strain(path: TimedPath) -> tuple[float, float]:
+def strain(path: JointTrajectory) -> tuple[float, float]:
     """The greatest speed and acceleration relative to the limits, by differences of the samples; before and after the path, rest."""
     step = path.t_s[1] - path.t_s[0]
     speeds = np.diff(path.joints_rad, axis=0) / step
@@ -228,8 +229,8 @@ def test_one_joint_and_other_degrees() -> None:
 def test_the_same_path_gives_the_same_motion() -> None:
     points = random_path("wild", 9)
     a, b = (time_path(points.copy(), DEGREE, VELOCITY, ACCELERATION, 0.02) for _ in range(2))
-    for left, right in zip(a, b, strict=True):
-        np.testing.assert_array_equal(left, right)
+    for name in ("t_s", "joints_rad", "velocities_rad_s"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 def test_the_control_points_are_left_alone_and_need_not_be_contiguous() -> None:

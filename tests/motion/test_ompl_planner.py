@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed
-from marl_handover.motion.witness import STEP_RAD, OmplMissing, rrt_connect
+from marl_handover.motion.ompl_planner import STEP_RAD, OmplMissing, rrt_connect
 
 pytest.importorskip("ompl")
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.geometry.kernels import elbow_up
-from marl_handover.motion.body import ArmBody
-from marl_handover.motion.splines import basis, sampled_basis
+from marl_handover.motion.collision_model import CollisionModel
+from marl_handover.motion.splines import basis, sample_places, sampled_basis
 
 Floats = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ def _fitting(control_points: int, degree: int) -> tuple[Floats, Floats]:
     return B, np.asarray(np.linalg.pinv(B[:, 1:-1]), float)
 
 
-def fitted(samples: Floats, limits: Floats, control_points: int, degree: int) -> Floats:
+def fit_control_points(samples: Floats, limits: Floats, control_points: int, degree: int) -> Floats:
     """Control points (N, 4) within ``limits`` (4, 2) near ``samples`` (SAMPLES, 4), ends exact."""
     B, inverse = _fitting(control_points, degree)
     ends = B[:, :1] * samples[0] + B[:, -1:] * samples[-1]
@@ -43,7 +43,7 @@ def fitted(samples: Floats, limits: Floats, control_points: int, degree: int) ->
     return np.concatenate([samples[:1], inner, samples[-1:]])
 
 
-def carrying_starts(body: ArmBody, ends_q: Floats, ends_mm: Floats, pick_height_mm: float, lift_mm: float) -> Iterator[Floats]:
+def carrying_guesses(body: CollisionModel, ends_q: Floats, ends_mm: Floats, pick_height_mm: float, lift_mm: float) -> Iterator[Floats]:
     """Joint samples (SAMPLES, 4) of structured guesses to carry the block between ``ends_mm`` (2, 2), joints ``ends_q`` (2, 4)."""
     yield _straight(body, ends_q, ends_mm, pick_height_mm, lift_mm, GRIP_LEAST_MM)
     yield _around(body, ends_q, ends_mm, pick_height_mm, lift_mm, None)
@@ -54,7 +54,7 @@ def carrying_starts(body: ArmBody, ends_q: Floats, ends_mm: Floats, pick_height_
     yield _posture(ends_q, POSTURES_DEG[2])
 
 
-def reaching_starts(body: ArmBody, ends_q: Floats, pin_mm: Floats, above_mm: float, pin_last: bool) -> Iterator[Floats]:
+def reaching_guesses(body: CollisionModel, ends_q: Floats, pin_mm: Floats, above_mm: float, pin_last: bool) -> Iterator[Floats]:
     """Joint samples of guesses for an empty hand between a posture and the pin at ``pin_mm`` (3,), by way of a point above it."""
     t = _even()[:, None]
     away = ends_q[0] if pin_last else ends_q[1]
@@ -75,7 +75,7 @@ def reaching_starts(body: ArmBody, ends_q: Floats, pin_mm: Floats, above_mm: flo
     yield ends_q[0] + (ends_q[1] - ends_q[0]) * t
 
 
-def bent(points: Floats, limits: Floats, degree: int, seed: int) -> Floats:
+def random_bend(points: Floats, limits: Floats, degree: int, seed: int) -> Floats:
     """Control points (N, 4) bent by a smooth random curve that leaves the ends alone."""
     generator = np.random.default_rng(seed)
     count = len(points)
@@ -83,15 +83,6 @@ def bent(points: Floats, limits: Floats, degree: int, seed: int) -> Floats:
     coefficients = generator.normal(size=(3, 4)) * _BEND_RAD / np.array([[1.0], [2.0], [3.0]])
     bend = sum(coefficients[k] * np.sin((k + 1) * math.pi * tau) for k in range(3))
     return np.concatenate([points[:1], np.clip((points + bend)[1:-1], limits[:, 0], limits[:, 1]), points[-1:]])
-
-
-@lru_cache(maxsize=16)
-def sample_places(samples: int, crowding: float) -> Floats:
-    """Values of tau (S,) from 0 to 1, denser towards both ends, where the lift-over profile is steep."""
-    even = np.linspace(0.0, 1.0, samples)
-    tau: Floats = even - crowding * np.sin(2 * math.pi * even) / (2 * math.pi)
-    tau[0], tau[-1] = 0.0, 1.0
-    return tau
 
 
 @lru_cache(maxsize=16)
@@ -132,7 +123,7 @@ def _lifted(planar: Floats, r: Floats, yaw: Floats, z: Floats) -> Floats:
     return joints
 
 
-def _straight(body: ArmBody, ends_q: Floats, ends_mm: Floats, pick_height_mm: float, lift_mm: float, r_least_mm: float) -> Floats:
+def _straight(body: CollisionModel, ends_q: Floats, ends_mm: Floats, pick_height_mm: float, lift_mm: float, r_least_mm: float) -> Floats:
     """Up, along the straight line, and down; not nearer to the base than ``r_least_mm``."""
     t = sample_places(SAMPLES, 0.5)
     distance = math.dist(*ends_mm)
@@ -142,7 +133,9 @@ def _straight(body: ArmBody, ends_q: Floats, ends_mm: Floats, pick_height_mm: fl
     return _inside(_lifted(body.planar, r, np.arctan2(p[:, 1], p[:, 0]), height), ends_q, body.limits)
 
 
-def _around(body: ArmBody, ends_q: Floats, ends_mm: Floats, pick_height_mm: float, lift_mm: float, radius_mm: float | None) -> Floats:
+def _around(
+    body: CollisionModel, ends_q: Floats, ends_mm: Floats, pick_height_mm: float, lift_mm: float, radius_mm: float | None
+) -> Floats:
     """Up, around the base at an even or at a given radius, and down."""
     t = _even()
     near = np.minimum(1.0, np.minimum(t, 1.0 - t) * 6.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,7 @@ SPOKES = 3
 
 
 @dataclass(frozen=True, eq=False)
-class ArmBody:
+class CollisionModel:
     """The packed shapes of one arm, bare and holding the block; layouts as in :mod:`marl_handover.geometry.kernels`.
 
     ``pairs`` index capsules that must not touch and might, within the joint ``limits`` (4, 2); the others are proved apart. ``edges``
@@ -47,7 +48,37 @@ class ArmBody:
     levers_mm: Floats
 
 
-def arm_body(model: CellModel, motion: MotionConfig) -> ArmBody:
+class Scene(NamedTuple):
+    """One arm, what it holds and what stands around it. Lengths in mm; layouts of the rows: :mod:`marl_handover.geometry.kernels`.
+
+    Attributes:
+        planar: (14,) the arm's links.
+        capsules: (K, 9) its shapes, sorted by level, then those of the held block.
+        carried: index of the first shape that is held.
+        pairs: (P, 2) indices of shapes that must not touch; first those of base or turret with the hand.
+        obstacles: (M, 9) of what stands around, the other arm's first.
+        arm_rows: how many of them are the other arm's.
+        group: (5,) a ball around all obstacles (x, y, z, radius), and the greatest clearance they demand.
+        clearance: (2,) demanded to itself and to the table.
+        pick_height: of the grip at both ends.
+        edges: (E, 2) the held block's lower edges (x, z) in the wrist's frame.
+        profile: (8,) of the lift-over: the two ends (x, y), the length scale of each end (0: it asks for nothing), lift, ground clearance.
+    """
+
+    planar: Floats
+    capsules: Floats
+    carried: int
+    pairs: Ints
+    obstacles: Floats
+    arm_rows: int
+    group: Floats
+    clearance: Floats
+    pick_height: float
+    edges: Floats
+    profile: Floats
+
+
+def arm_collision_model(model: CellModel, motion: MotionConfig) -> CollisionModel:
     """The shapes of a cell's arm, its fingers opened by ``finger_travel_mm``."""
     arm = model.arm
     planar = arm.planar
@@ -91,7 +122,7 @@ def arm_body(model: CellModel, motion: MotionConfig) -> ArmBody:
     planar = np.concatenate([planar, _planar_ball(fixed), _planar_ball(hand)])
     levers = _levers_mm(planar, held, limits)
     bare_pairs = all_pairs[all_pairs.max(axis=1) < len(capsules)]
-    return ArmBody(planar, capsules, bare_pairs, held, all_pairs, edges, limits, float(levers[0]), levers)
+    return CollisionModel(planar, capsules, bare_pairs, held, all_pairs, edges, limits, float(levers[0]), levers)
 
 
 def _standing(row: list[float]) -> list[float]:
@@ -117,7 +148,9 @@ def block_capsules(block: BlockConfig, grip_to_table_mm: float) -> list[Capsule]
     return [*shapes, Capsule("pin", (0.0, 0.0, bottom), (0.0, 0.0, top), pin)]
 
 
-def standing_arm(body: ArmBody, arm: ArmModel, motion: MotionConfig, q: Floats, x_mm: float, y_mm: float, facing_rad: float) -> Floats:
+def standing_arm(
+    body: CollisionModel, arm: ArmModel, motion: MotionConfig, q: Floats, x_mm: float, y_mm: float, facing_rad: float
+) -> Floats:
     """Obstacle rows (M, 9) of another arm of the same kind that holds still at ``q`` (5,), its base at a pose in the moving arm's frame."""
     bare = body.capsules
     if q[4] == 0.0:
@@ -168,7 +201,7 @@ def _planar_ball(capsules: Floats) -> Floats:
     return np.array([centre[0], centre[2], away.max()])
 
 
-def out_of_reach(body: ArmBody, obstacles: Floats) -> NDArray[np.bool_]:
+def out_of_reach(body: CollisionModel, obstacles: Floats) -> NDArray[np.bool_]:
     """Which obstacle rows (M,) the arm cannot come near to in any posture, whatever it holds: those are proved clear."""
     if not len(obstacles):
         return np.zeros(0, bool)

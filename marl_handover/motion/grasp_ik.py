@@ -14,7 +14,7 @@ EDGE_RAD = 1e-4
 """A pose at the very edge may need a joint this far past its limit; the joint stays at the limit, the grip is some 20 um off."""
 
 
-def level_joints(model: CellModel, arm: int, what: str, position_mm: Floats) -> Floats:
+def grasp_joints(model: CellModel, arm: int, what: str, position_mm: Floats) -> Floats:
     """Joints (5,) with the grip at the pick height over a world position (2,), pitch = roll = 0; ``what`` the arm is to do there.
 
     Raises:

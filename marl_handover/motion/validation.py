@@ -9,9 +9,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marl_handover.geometry.kernels import FAR_MM, at_wrist, beyond, hand_ball, hand_is_away, nearest, pivots, place_capsules, turned
+from marl_handover.geometry.kernels import (
+    FAR_MM,
+    at_wrist,
+    broad_phase,
+    closest_points,
+    forward_kinematics,
+    hand_ball,
+    hand_is_away,
+    into_arm_plane,
+    place_capsules,
+)
+from marl_handover.motion.collision_model import Scene
 from marl_handover.motion.objective import first_moving, ramp
-from marl_handover.motion.scene import Scene
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -60,7 +70,7 @@ def dense_margins(Q: Floats, scene: Scene, out: Floats) -> float:
     length, px, py, pz = 0.0, 0.0, 0.0, 0.0
     for stride in (COARSE, 1):
         for i in range(0, Q.shape[0], stride):
-            pivots(planar, Q, i, frames, 0)
+            forward_kinematics(planar, Q, i, frames, 0)
             place_capsules(capsules, frames, 0, ends)
             cy, sy = math.cos(Q[i, 0]), math.sin(Q[i, 0])
             _around(cy, sy, first, hand, planar, capsules, obstacles, scene.arm_rows, frames, ends, placed, point, out)
@@ -88,13 +98,13 @@ def _around(
     """Take one sample's distances to obstacles into ``out``; the hand's shapes are skipped together where a ball around them is away."""
     hand_ball(planar, frames, 0, placed, 1)
     for j in range(obstacles.shape[0]):
-        turned(obstacles, j, cy, sy, placed, 0)
+        into_arm_plane(obstacles, j, cy, sy, placed, 0)
         field = 0 if j < arm_rows else 1
         away = obstacles[j, 6] + obstacles[j, 7]
-        for k in range(first, hand if beyond(placed, 1, placed, 0, away + planar[13] + out[field]) else capsules.shape[0]):
+        for k in range(first, hand if broad_phase(placed, 1, placed, 0, away + planar[13] + out[field]) else capsules.shape[0]):
             need = away + capsules[k, 7]
-            if not beyond(ends, k, placed, 0, need + out[field]):
-                out[field] = min(out[field], nearest(ends, k, placed, 0, point) - need)
+            if not broad_phase(ends, k, placed, 0, need + out[field]):
+                out[field] = min(out[field], closest_points(ends, k, placed, 0, point) - need)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -110,7 +120,7 @@ def _itself(
     for p in range(grouped, P):
         a, b = pairs[p, 0], pairs[p, 1]
         need = clearance[0] + capsules[a, 7] + capsules[b, 7]
-        if not beyond(ends, a, ends, b, need + out[2]):
-            out[2] = min(out[2], nearest(ends, a, ends, b, point) - need)
+        if not broad_phase(ends, a, ends, b, need + out[2]):
+            out[2] = min(out[2], closest_points(ends, a, ends, b, point) - need)
     for k in range(first, carried):
         out[3] = min(out[3], min(ends[k, 2], ends[k, 5]) - capsules[k, 7] - clearance[1])

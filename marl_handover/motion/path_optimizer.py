@@ -10,13 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.motion.body import MARGIN_MM, ArmBody, ball_around, out_of_reach
-from marl_handover.motion.descent import Effort, Spline, descend
-from marl_handover.motion.scene import Scene
-from marl_handover.motion.splines import basis, sampled_basis
-from marl_handover.motion.starts import bent, fitted, sample_places, smoothing_metric
+from marl_handover.motion.augmented_lagrangian import SolverOptions, Spline, minimize
+from marl_handover.motion.collision_model import MARGIN_MM, CollisionModel, Scene, ball_around, out_of_reach
+from marl_handover.motion.initial_guesses import fit_control_points, random_bend, smoothing_metric
+from marl_handover.motion.splines import basis, sample_places, sampled_basis
 from marl_handover.motion.trajectory import NoPath
-from marl_handover.motion.verify import ROUNDING_MM, Margins, dense_margins
+from marl_handover.motion.validation import ROUNDING_MM, Margins, dense_margins
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +24,7 @@ DESCENT_SAMPLES, CROWDING = 41, 0.6
 WEIGHTS = np.array([0.1, 0.005])
 """Of even speed and of joint motion, beside the length: enough to leave no direction without curvature."""
 
-EFFORT = Effort(penalty=0.1, growth=10.0, rounds=5, steps=30, gain=1e-4, slack_mm=0.2)
+SOLVER_OPTIONS = SolverOptions(penalty=0.1, growth=10.0, rounds=5, steps=30, gain=1e-4, slack_mm=0.2)
 
 ALIKE_RAD = 1e-3
 SHORTEST_MM = 20.0
@@ -67,14 +66,14 @@ class Segment:
     """A path of one arm in its base frame.
 
     Attributes:
-        body: the arm.
+        collision_model: the arm.
         scene: what the path is judged against.
         ends: (2, 4) joints at start and end, roll left out, in rad.
         lower_bound_mm: no path is shorter.
         expected_mm: what the length is likely to be at best; paths near it are not searched on.
     """
 
-    body: ArmBody
+    collision_model: CollisionModel
     scene: Scene
     ends: Floats
     lower_bound_mm: float
@@ -86,9 +85,9 @@ class Segment:
         length = dense_margins(np.ascontiguousarray(joints), self.scene, out)
         return Margins(*(float(value) for value in out)), float(length)
 
-    def improve(self, points: Floats, degree: int, margins_mm: Floats, effort: Effort) -> tuple[Floats, int]:
+    def improve(self, points: Floats, degree: int, margins_mm: Floats, options: SolverOptions) -> tuple[Floats, int]:
         """Control points (N, 4) after the descent that asks for ``margins_mm`` (5,) more than is demanded, and its evaluations."""
-        near = self.scene.obstacles[~out_of_reach(self.body, self.scene.obstacles)]
+        near = self.scene.obstacles[~out_of_reach(self.collision_model, self.scene.obstacles)]
         asked = self.scene._replace(
             obstacles=(obstacles := near + margins_mm[0] * (np.arange(9) == 7)),
             group=ball_around(obstacles),
@@ -97,8 +96,8 @@ class Segment:
         )
         spline = _spline(len(points), degree)
         metric = spline.metric * max(self.lower_bound_mm, SHORTEST_MM)
-        spline = spline._replace(metric=metric, limits=self.body.limits)
-        x, _, evaluations = descend(np.ascontiguousarray(points), spline, asked, WEIGHTS, effort)
+        spline = spline._replace(metric=metric, limits=self.collision_model.limits)
+        x, _, evaluations = minimize(np.ascontiguousarray(points), spline, asked, WEIGHTS, options)
         return x, evaluations
 
 
@@ -115,7 +114,7 @@ def find_path(
 
     Args:
         segment: what is asked.
-        guesses: joint samples of first guesses, each (S, 4), S as :mod:`marl_handover.motion.starts` has it.
+        guesses: joint samples of first guesses, each (S, 4), S as :mod:`marl_handover.motion.initial_guesses` has it.
         control_points: N.
         degree: of the spline.
         starts: guesses and random bends of them, at most.
@@ -125,14 +124,14 @@ def find_path(
     Raises:
         NoPath: with the reason.
     """
-    refuse_bad_ends(segment)
+    require_free_ends(segment)
     best: FoundPath | None = None
     feasible, evaluations, miss = 0, 0, Margins(*[-np.inf] * 6)
     fitted_guesses: list[Floats] = []
     supply = iter(guesses)
     for start in range(starts):
-        points = _next_start(supply, fitted_guesses, segment.body.limits, control_points, degree, start)
-        found, margins, used = attempt(segment, points, degree, beat_mm=np.inf if best is None else best.length_mm)
+        points = _next_start(supply, fitted_guesses, segment.collision_model.limits, control_points, degree, start)
+        found, margins, used = solve_from(segment, points, degree, beat_mm=np.inf if best is None else best.length_mm)
         evaluations += used
         if found is None:
             miss = max(miss, margins, key=lambda m: m.worst)
@@ -152,15 +151,15 @@ def find_path(
 def _next_start(supply: Iterator[Floats], before: list[Floats], limits: Floats, control_points: int, degree: int, seed: int) -> Floats:
     """Control points of the next guess that is unlike the ones ``before``, to which it is added; when there is none, of a bend of one."""
     for samples in supply:
-        points = fitted(samples, limits, control_points, degree)
+        points = fit_control_points(samples, limits, control_points, degree)
         if not any(np.abs(points - other).max() < ALIKE_RAD for other in before):
             before.append(points)
             return points
-    return bent(before[seed % len(before)], limits, degree, seed)
+    return random_bend(before[seed % len(before)], limits, degree, seed)
 
 
-def attempt(
-    segment: Segment, points: Floats, degree: int, effort: Effort = EFFORT, beat_mm: float = np.inf
+def solve_from(
+    segment: Segment, points: Floats, degree: int, options: SolverOptions = SOLVER_OPTIONS, beat_mm: float = np.inf
 ) -> tuple[FoundPath | None, Margins, int]:
     """One start: descend, check densely, ask for more where it fell short, descend again.
 
@@ -168,9 +167,9 @@ def attempt(
     """
     asked, evaluations = FIRST_MARGINS_MM.copy(), 0
     dense = np.array(sampled_basis(DENSE_SAMPLES, len(points), degree))
-    low, high = segment.body.limits.T
+    low, high = segment.collision_model.limits.T
     for repair in range(REPAIRS):
-        points, used = segment.improve(points, degree, asked, effort)
+        points, used = segment.improve(points, degree, asked, options)
         points[1:-1] = np.clip(points[1:-1], low, high)  # what the descent leaves over is small; inside them, the whole path is
         evaluations += used
         margins, length = segment.check(dense @ points)
@@ -184,7 +183,7 @@ def attempt(
     return None, margins, evaluations
 
 
-def refuse_bad_ends(segment: Segment) -> None:
+def require_free_ends(segment: Segment) -> None:
     """Raise :class:`NoPath` if an end itself is too near something; no path could help."""
     for reason, q in (("start", segment.ends[:1]), ("end", segment.ends[1:])):
         margins, _ = segment.check(q)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from marl_handover.geometry.capsules import capsule_pairs, segment_distance
-from marl_handover.motion.overlap import earliest_start_s, overlapped
+from marl_handover.motion.coordination import coordinate, earliest_start_s
 from tests.motion.test_motion_planner import place
 
 
@@ -14,10 +14,10 @@ from tests.motion.test_motion_planner import place
 def motions(model, planner):
     """A block handed over in the middle, and back."""
     pick, middle, end = place(model, 0, 190, 1.2), np.array([20.0, 5.0]), place(model, 1, 200, -1.0)
-    park = planner.parked_rad
+    park = planner.home_rad
     return [
-        planner.cycle(0, pick, middle, park, park), planner.cycle(1, middle, end, park, park),
-        planner.cycle(1, end, middle, park, park), planner.cycle(0, middle, pick, park, park),
+        planner.pick_place(0, pick, middle, park, park), planner.pick_place(1, middle, end, park, park),
+        planner.pick_place(1, end, middle, park, park), planner.pick_place(0, middle, pick, park, park),
     ]  # fmt: skip
 
 
@@ -62,7 +62,7 @@ def test_the_next_arm_starts_early_and_clear(model, planner, motions):
 
 
 def test_a_sequence_takes_less_time_overlapped(planner, motions):
-    schedule = overlapped(planner, motions)
+    schedule = coordinate(planner, motions)
     assert schedule.starts_s[0] == 0
     assert schedule.sequential_s == pytest.approx(sum(motion.duration_s for motion in motions))
     assert schedule.overlapped_s < schedule.sequential_s
@@ -72,11 +72,11 @@ def test_a_sequence_takes_less_time_overlapped(planner, motions):
 
 
 def test_random_hand_overs_keep_clear_between_samples(model, planner):
-    generator, park = np.random.default_rng(2), planner.parked_rad
+    generator, park = np.random.default_rng(2), planner.home_rad
     for _ in range(6):
         pick, end = (place(model, arm, *generator.uniform([150, -1.5], [230, 1.5])) for arm in range(2))
         middle = model.cell.chart.to_table(*generator.uniform(-1, 1, 2))
-        before, motion = planner.cycle(0, pick, middle, park, park), planner.cycle(1, middle, end, park, park)
+        before, motion = planner.pick_place(0, pick, middle, park, park), planner.pick_place(1, middle, end, park, park)
         start = earliest_start_s(planner, before, motion)
         for t in np.arange(start, before.duration_s, 0.005):
             gap = arm_gap(model, planner, np.stack([joints_at(before, t), joints_at(motion, t - start)]))
@@ -84,4 +84,4 @@ def test_random_hand_overs_keep_clear_between_samples(model, planner):
 
 
 def test_no_cycle_no_time(planner):
-    assert overlapped(planner, []) == ((), 0, 0.0)
+    assert coordinate(planner, []) == ((), 0, 0.0)

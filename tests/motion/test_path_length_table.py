@@ -14,7 +14,7 @@ from marl_handover.cell import GROUP, Cell, build_cell, cell_config
 from marl_handover.config import MotionConfig, RewardConfig, TaskConfig
 from marl_handover.envs import SupervisorEnv, SupervisorGoalEnv
 from marl_handover.errors import CorruptFile, MissingFile
-from marl_handover.motion import cost
+from marl_handover.motion import path_length_table as tables
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import adapted, load
 from marl_handover.resources import package_path
@@ -37,18 +37,18 @@ def transfers(cell: Cell, count: int, seed: int) -> tuple[np.ndarray, np.ndarray
 
 @pytest.fixture(scope="module")
 def table(paper):
-    return cost.cost_table(paper, MOTION)
+    return tables.path_length_table(paper, MOTION)
 
 
 def test_the_shipped_table_is_that_of_the_default_settings(paper):
     """Otherwise every user builds it anew; run scripts/build_motion_cost.py."""
-    assert cost.read_table(package_path(cost.SHIPPED), cost.settings_key(paper, MOTION)).key
+    assert tables.read_table(package_path(tables.SHIPPED), tables.settings_key(paper, MOTION)).key
 
 
 def test_it_is_near_the_planner(paper, table):
     planner = MotionPlanner(build_cell(cell_config("paper")), MOTION)
     arm, start, end = transfers(paper, 150, 3)
-    lengths = np.array([planner.transfer(int(a), p, q, planner.parked_rad).length_mm for a, p, q in zip(arm, start, end, strict=True)])
+    lengths = np.array([planner.transfer(int(a), p, q, planner.home_rad).length_mm for a, p, q in zip(arm, start, end, strict=True)])
     error = abs(table(paper, arm, start, end) / lengths - 1)
     straight = abs(straight_line_mm(paper, arm, start, end) / lengths - 1)
     assert np.median(error) < 0.004
@@ -106,30 +106,30 @@ def test_interpolation_is_linear_between_nodes_and_constant_beyond(seed, dimensi
     places = random.uniform(-1.0, 6.0, (dimensions, 40))
     inside = np.clip(places, 0, np.array(table.shape)[:, None] - 1)
     theirs = RegularGridInterpolator([np.arange(count) for count in table.shape], table)(inside.T)
-    np.testing.assert_allclose(cost.interpolated(table, list(places)), theirs, atol=1e-12)
+    np.testing.assert_allclose(tables.interpolated(table, list(places)), theirs, atol=1e-12)
 
 
 def test_a_stored_table_comes_back_and_another_cells_is_refused(table, tmp_path, paper):
     path = tmp_path / "costs.npz"
     table.save(path)
-    again = cost.read_table(path, table.key)
+    again = tables.read_table(path, table.key)
     np.testing.assert_array_equal(again.excess_mm, table.excess_mm)
     np.testing.assert_array_equal(again.string_mm, table.string_mm)
     assert [file.name for file in tmp_path.iterdir()] == ["costs.npz"]
-    higher = cost.settings_key(paper, replace(MOTION, lift_mm=60.0))
-    with pytest.raises(cost.StaleTable, match=f"settings {table.key}, but {higher} was asked for"):
-        cost.read_table(path, higher)
+    higher = tables.settings_key(paper, replace(MOTION, lift_mm=60.0))
+    with pytest.raises(tables.StaleTable, match=f"settings {table.key}, but {higher} was asked for"):
+        tables.read_table(path, higher)
 
 
 @pytest.mark.parametrize("spoil", [lambda whole: whole[: len(whole) // 2], lambda whole: b"", lambda whole: b"PK" + whole[:100]])
 def test_a_damaged_table_is_refused(table, tmp_path, spoil):
     path = tmp_path / "costs.npz"
     with pytest.raises(MissingFile):
-        cost.read_table(path, table.key)
+        tables.read_table(path, table.key)
     table.save(path)
     path.write_bytes(spoil(path.read_bytes()))
     with pytest.raises(CorruptFile, match=str(path)):
-        cost.read_table(path, table.key)
+        tables.read_table(path, table.key)
 
 
 def test_a_table_of_another_shape_or_not_finite_is_refused(table, tmp_path):
@@ -137,37 +137,37 @@ def test_a_table_of_another_shape_or_not_finite_is_refused(table, tmp_path):
     for wrong in ({"excess_mm": table.excess_mm[1:]}, {"string_mm": table.string_mm * math.nan}):
         replace(table, **wrong).save(path)
         with pytest.raises(CorruptFile, match="shapes"):
-            cost.read_table(path, table.key)
+            tables.read_table(path, table.key)
 
 
 def test_the_key_follows_what_the_paths_depend_on(paper):
-    key = cost.settings_key(paper, MOTION)
+    key = tables.settings_key(paper, MOTION)
     config = paper.config
     same = [(replace(paper, config=replace(config, name="else", chart_inset=0.9)), MOTION), (paper, replace(MOTION, velocity_share=0.5))]
-    assert {cost.settings_key(*settings) for settings in same} == {key}
+    assert {tables.settings_key(*settings) for settings in same} == {key}
     others = [
         (replace(paper, config=replace(config, pick_height_mm=50.0)), MOTION),
         (replace(paper, config=replace(config, block=replace(config.block, side_mm=41.0))), MOTION),
         (paper, replace(MOTION, lift_mm=41.0)),
         (paper, replace(MOTION, parked_deg=[10.0, *MOTION.parked_deg[1:]])),
     ]
-    keys = [cost.settings_key(*settings) for settings in others]
+    keys = [tables.settings_key(*settings) for settings in others]
     assert len({key, *keys}) == len(others) + 1
 
 
 def test_a_new_cells_table_is_built_once_and_kept(paper, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for name, count in (("RADII", 2), ("YAWS", 2), ("DISTANCES", 9)):
-        monkeypatch.setattr(cost, name, count)
+        monkeypatch.setattr(tables, name, count)
     low = replace(MOTION, lift_mm=20.0)
-    built = cost.cost_table(paper, low)
-    file = cost.cache_file(built.key)
+    built = tables.path_length_table(paper, low)
+    file = tables.cache_file(built.key)
     assert file.parent.parent == tmp_path
-    np.testing.assert_array_equal(cost.read_table(file, built.key).excess_mm, built.excess_mm)
+    np.testing.assert_array_equal(tables.read_table(file, built.key).excess_mm, built.excess_mm)
     written = file.stat().st_mtime_ns
-    assert cost.cost_table(paper, low) is built
-    monkeypatch.setattr(cost, "_TABLES", {})
-    np.testing.assert_array_equal(cost.cost_table(paper, low).excess_mm, built.excess_mm)
+    assert tables.path_length_table(paper, low) is built
+    monkeypatch.setattr(tables, "_TABLES", {})
+    np.testing.assert_array_equal(tables.path_length_table(paper, low).excess_mm, built.excess_mm)
     assert file.stat().st_mtime_ns == written
     assert (built.excess_mm >= 0).all()
     assert (built.excess_mm == built.excess_mm.transpose(1, 0, 2)).all()
@@ -175,10 +175,10 @@ def test_a_new_cells_table_is_built_once_and_kept(paper, tmp_path, monkeypatch):
 
 def test_a_node_without_a_path_is_as_dear_as_any(paper, monkeypatch):
     for name, count in (("RADII", 2), ("YAWS", 3), ("DISTANCES", 9)):
-        monkeypatch.setattr(cost, name, count)
+        monkeypatch.setattr(tables, name, count)
     found = iter([10.0, math.nan, 3.0, 4.0, 5.0, 30.0, 7.0])
-    monkeypatch.setattr(cost, "_excess_mm", lambda *_: next(found))
-    built = cost.build_table(paper, MOTION, progress=False)
+    monkeypatch.setattr(tables, "_excess_mm", lambda *_: next(found))
+    built = tables.build_table(paper, MOTION, progress=False)
     assert built.excess_mm.tolist() == [[[0, 10, 30], [3, 4, 5]], [[3, 4, 5], [0, 30, 7]]]
     assert next(found, None) is None
 
@@ -186,16 +186,16 @@ def test_a_node_without_a_path_is_as_dear_as_any(paper, monkeypatch):
 def test_the_string_is_the_planners_lower_bound(paper, table):
     planner = MotionPlanner(build_cell(cell_config("paper")), MOTION)
     for arm, start, end in zip(*transfers(paper, 40, 8), strict=True):
-        bound = planner.carrying(int(arm), start, end, planner.parked_rad)[0].lower_bound_mm
-        string = cost.interpolated(table.string_mm, [np.linalg.norm(end - start) / table._distance_step])
+        bound = planner.carrying(int(arm), start, end, planner.home_rad)[0].lower_bound_mm
+        string = tables.interpolated(table.string_mm, [np.linalg.norm(end - start) / table._distance_step])
         assert string == pytest.approx(bound, abs=0.05)
 
 
 def test_rules_without_weight_keep_the_straight_line(paper, table):
-    assert cost.motion_cost(paper, TaskConfig()) is straight_line_mm
+    assert tables.motion_cost(paper, TaskConfig()) is straight_line_mm
     task = TaskConfig(reward=RewardConfig(motion_weight=2.0))
-    assert cost.motion_cost(paper, task) is table
-    rules = Rules(paper, task, cost.motion_cost(paper, task))
+    assert tables.motion_cost(paper, task) is table
+    rules = Rules(paper, task, tables.motion_cost(paper, task))
     arm, start, end = transfers(paper, 5, 9)
     np.testing.assert_allclose(rules.motion_penalty(arm, start, end), 2.0 * table(paper, arm, start, end) / 100)
 

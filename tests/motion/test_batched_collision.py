@@ -10,12 +10,11 @@ from marl_handover.cell import build_cell, cell_config
 from marl_handover.cell.symmetry import Symmetry
 from marl_handover.config import CentralisedConfig, MotionConfig
 from marl_handover.geometry.capsules import segment_distance
-from marl_handover.motion.batched import CROWDING, ROUNDING_MM, MotionCheck
-from marl_handover.motion.batched_points import JOINTS, MotionNumbers, ends_of
-from marl_handover.motion.grasp import level_joints
+from marl_handover.motion.batched_collision import CROWDING, ROUNDING_MM, MotionCheck
+from marl_handover.motion.batched_paths import JOINTS, MotionNumbers, ends_of
+from marl_handover.motion.grasp_ik import grasp_joints
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.splines import basis
-from marl_handover.motion.starts import sample_places
+from marl_handover.motion.splines import basis, sample_places
 
 SAMPLES = 33
 BAND_MM = 0.02
@@ -40,7 +39,7 @@ class Kit:
         rows = []
         for number in range(len(arm)):
             ends = (part[number].double().numpy() for part in (from_mm, to_mm))
-            segment, _ = self.planner.carrying(int(arm[number]), *ends, self.planner.parked_rad)
+            segment, _ = self.planner.carrying(int(arm[number]), *ends, self.planner.home_rad)
             margins, _ = segment.check(B @ points[number].double().numpy())
             rows.append([margins.arm, margins.itself, margins.ground, margins.edge + ROUNDING_MM])
         return np.min(rows, axis=1), np.argmin(rows, axis=1)
@@ -98,7 +97,7 @@ def test_agrees_with_the_compiled_check_on_random_postures():
     """Arms that hold still anywhere, the other one leaning in: every kind of collision is the tightest somewhere."""
     kit = Kit("paper", [10.0, 60.0, -109.0, 40.0, 0.0])
     arm, from_mm, to_mm = ways(kit.cell, 800, seed=2)
-    low, high = torch.tensor(kit.planner.body.limits, dtype=torch.float32).unbind(-1)
+    low, high = torch.tensor(kit.planner.collision_model.limits, dtype=torch.float32).unbind(-1)
     share = (uniform(800, JOINTS) + 1) / 2
     share[400:, 0] = 0.5 + 0.4 * (share[400:, 0] - 0.5)  # half of them towards the other arm
     points = (low + share * (high - low))[:, None].expand(-1, 7, -1)
@@ -114,7 +113,7 @@ def test_a_joint_past_its_limit_is_refused(kit):
     points = numbers.points(ends, torch.zeros(50, numbers.count))
     good = kit.check.passes(arm, points, ends)
     assert good.sum() > 30
-    for joint, (low, high) in enumerate(kit.planner.body.limits):
+    for joint, (low, high) in enumerate(kit.planner.collision_model.limits):
         for past in (low - 0.01, high + 0.01):
             outside = points.clone()
             outside[:, 3, joint] = past
@@ -147,7 +146,7 @@ def test_ends_are_the_executors_grasps(kit):
     found = kit.numbers["flat"].end_joints(ends_of(kit.cell, arm, from_mm, to_mm)).numpy()
     for number in range(200):
         for end, place in enumerate((from_mm, to_mm)):
-            expected = level_joints(kit.model, int(arm[number]), "grasp", place[number].double().numpy())
+            expected = grasp_joints(kit.model, int(arm[number]), "grasp", place[number].double().numpy())
             np.testing.assert_allclose(found[number, end], expected[:JOINTS], atol=2e-5)
             assert expected[4] == 0.0
 
@@ -157,7 +156,7 @@ def test_a_path_goes_from_pick_to_place_within_the_limits(kit, kind):
     arm, from_mm, to_mm = ways(kit.cell, 300, seed=7)
     numbers, ends = kit.numbers[kind], ends_of(kit.cell, arm, from_mm, to_mm)
     points = numbers.points(ends, uniform(300, numbers.count))
-    low, high = torch.tensor(kit.planner.body.limits, dtype=torch.float32).unbind(-1)
+    low, high = torch.tensor(kit.planner.collision_model.limits, dtype=torch.float32).unbind(-1)
     assert points.shape == (300, 7, JOINTS)
     assert ((points >= low) & (points <= high)).all()
     assert torch.equal(points[:, [0, -1]], numbers.end_joints(ends))
@@ -166,7 +165,7 @@ def test_a_path_goes_from_pick_to_place_within_the_limits(kit, kind):
 def test_flat_numbers_span_the_limits(kit):
     arm, from_mm, to_mm = ways(kit.cell, 2, seed=8)
     numbers, ends = kit.numbers["flat"], ends_of(kit.cell, arm, from_mm, to_mm)
-    limits = torch.tensor(kit.planner.body.limits, dtype=torch.float32)
+    limits = torch.tensor(kit.planner.collision_model.limits, dtype=torch.float32)
     for value, expected in ((-1.0, limits[:, 0]), (1.0, limits[:, 1]), (0.0, limits.mean(-1))):
         inner = numbers.points(ends, torch.full((2, numbers.count), value))[:, 1:-1]
         torch.testing.assert_close(inner, expected.expand_as(inner), atol=1e-6, rtol=0)
@@ -176,7 +175,7 @@ def test_an_offset_is_added_to_the_straight_guess(kit):
     arm, from_mm, to_mm = ways(kit.cell, 100, seed=9)
     numbers, ends = kit.numbers["offset"], ends_of(kit.cell, arm, from_mm, to_mm)
     guess = numbers.points(ends, torch.zeros(100, numbers.count))
-    low, high = torch.tensor(kit.planner.body.limits, dtype=torch.float32).unbind(-1)
+    low, high = torch.tensor(kit.planner.collision_model.limits, dtype=torch.float32).unbind(-1)
     for index in range(0, numbers.count, 3):
         one = torch.zeros(100, numbers.count)
         one[:, index] = 0.2

@@ -11,8 +11,8 @@ from marl_handover.config import MotionConfig, require_between, require_positive
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.motion.timing import TimedPath, time_path
-from marl_handover.motion.trajectory import CyclePaths, Phase
+from marl_handover.motion.time_parametrization import time_path
+from marl_handover.motion.trajectory import JointTrajectory, Phase, PickPlacePaths
 
 Floats = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ JOINED_RAD = 1e-9
 """The end of a path and the beginning of the next are the same up to rounding."""
 
 
-def timed_phases(paths: CyclePaths, arm: ArmModel, motion: MotionConfig, pick_height_mm: float) -> tuple[Phase, ...]:
+def timed_phases(paths: PickPlacePaths, arm: ArmModel, motion: MotionConfig, pick_height_mm: float) -> tuple[Phase, ...]:
     """The timed phases of a cycle, in the order of :data:`~marl_handover.motion.trajectory.PHASES`.
 
     Approach, transfer and retreat each go from rest to rest, as fast as the limits allow: ``motion.velocity_share`` of the URDF's joint
@@ -82,7 +82,7 @@ def _still(q: Floats, from_mm: float, to_mm: float, duration_s: float, sample_s:
     return np.linspace(0.0, duration_s, samples), np.tile(q, (samples, 1)), np.linspace(from_mm, to_mm, samples)
 
 
-def _transfer_parts(transfer: TimedPath, arm: ArmModel, pick_height_mm: float) -> list[tuple[str, slice]]:
+def _transfer_parts(transfer: JointTrajectory, arm: ArmModel, pick_height_mm: float) -> list[tuple[str, slice]]:
     """The samples of lift, transfer and lower, each beginning with the last of the one before."""
     last = len(transfer.t_s) - 1
     lifted = np.flatnonzero(arm.fk(transfer.joints_rad)[:, 2, 3] >= pick_height_mm + LIFTED_MM)

@@ -2,9 +2,9 @@
 
 All 7 x 5 coordinates of the control points are variables. Equality constraints hold both ends at the demanded poses; heights and clearances
 are inequalities at each sample between them, 101 in all; the joint limits are bounds. The grip's path length is integrated by the
-trapezoidal rule over 100 intervals. Gradients are SLSQP's own finite differences. One start: the line in joint space, lifted. What is
-demanded is what :class:`~marl_handover.motion.segment.Segment` demands, computed by the same compiled geometry: what is compared with this
-is the formulation, not Python.
+trapezoidal rule over 100 intervals. Gradients are SLSQP's own finite differences. One start: the line in joint space, lifted. The demands
+are those of :class:`~marl_handover.motion.path_optimizer.Segment`, computed by the same compiled geometry: what is compared with this is
+the formulation, not Python.
 
 Heights at both ends are met exactly by the poses; demanded there once more, SLSQP finds its linear problems incompatible and gives up at
 12 of 20 transfers. The program holds its demands at the samples only, so the dense check mostly finds a path short by a fraction of a
@@ -22,10 +22,10 @@ from scipy.optimize import minimize
 
 from marl_handover.geometry.closed_form import grip_in_plane, grip_speed
 from marl_handover.geometry.kernels import elbow_up
-from marl_handover.motion.scene import Scene
-from marl_handover.motion.segment import DENSE_SAMPLES, FoundPath, NoPath, Segment, refuse_bad_ends
+from marl_handover.motion.collision_model import Scene
+from marl_handover.motion.path_optimizer import DENSE_SAMPLES, FoundPath, NoPath, Segment, require_free_ends
 from marl_handover.motion.splines import sampled_basis
-from marl_handover.motion.verify import dense_margins
+from marl_handover.motion.validation import dense_margins
 
 Floats = NDArray[np.float64]
 
@@ -38,8 +38,8 @@ END_TOLERANCE_MM, END_TOLERANCE_RAD = 0.01, 1e-4
 """How well an equality constraint has to hold."""
 
 
-def plan_paper(segment: Segment, maxiter: int = 100, tolerance_mm: float = 0.0) -> FoundPath:
-    """The path SLSQP finds, checked at :data:`~marl_handover.motion.segment.DENSE_SAMPLES` samples.
+def plan_slsqp(segment: Segment, maxiter: int = 100, tolerance_mm: float = 0.0) -> FoundPath:
+    """The path SLSQP finds, checked at :data:`~marl_handover.motion.path_optimizer.DENSE_SAMPLES` samples.
 
     Args:
         segment: what is asked.
@@ -52,7 +52,7 @@ def plan_paper(segment: Segment, maxiter: int = 100, tolerance_mm: float = 0.0) 
     Raises:
         NoPath: an end itself is too near something, or the path misses a demand by more than the tolerance.
     """
-    refuse_bad_ends(segment)
+    require_free_ends(segment)
     solution, iterations = solve(segment, maxiter)
     misses = np.abs(_pose_errors(segment, solution))
     if max(misses[:, :3].max() / END_TOLERANCE_MM, misses[:, 3:].max() / END_TOLERANCE_RAD) > 1.0:
@@ -66,7 +66,7 @@ def plan_paper(segment: Segment, maxiter: int = 100, tolerance_mm: float = 0.0) 
 
 def solve(segment: Segment, maxiter: int) -> tuple[Floats, int]:
     """Where SLSQP ends, feasible or not: control points (7, 5) in rad within the joint limits, and its iterations."""
-    lower, upper = np.append(segment.body.limits[:, 0], -np.pi / 2), np.append(segment.body.limits[:, 1], np.pi / 2)
+    lower, upper = np.append(segment.collision_model.limits[:, 0], -np.pi / 2), np.append(segment.collision_model.limits[:, 1], np.pi / 2)
     basis, slope = (np.array(sampled_basis(INTERVALS + 1, CONTROL_POINTS, DEGREE, derivative)) for derivative in (0, 1))
 
     def length(x: Floats) -> float:
@@ -103,13 +103,13 @@ def first_guess(segment: Segment) -> Floats:
     raised = np.empty((CONTROL_POINTS, 3))
     elbow_up(segment.scene.planar, r, z + segment.scene.profile[6] * (t[:, 0] > 0.0) * (t[:, 0] < 1.0), line[:, 1:].sum(axis=1), raised)
     pitches = np.where(np.isnan(raised), line[:, 1:], raised)
-    inner = np.clip(pitches, segment.body.limits[1:, 0], segment.body.limits[1:, 1])
+    inner = np.clip(pitches, segment.collision_model.limits[1:, 0], segment.collision_model.limits[1:, 1])
     return np.concatenate([line[:, :1], inner, np.zeros((CONTROL_POINTS, 1))], axis=1)
 
 
 @njit(cache=True, nogil=True)
 def sample_margins(Q: Floats, scene: Scene, out: Floats) -> None:
-    """Fill ``out`` (S, 6) with the fields of :class:`~marl_handover.motion.verify.Margins` of each of the joint samples ``Q`` (S, 4)."""
+    """Fill ``out`` (S, 6) with the fields of :class:`~marl_handover.motion.validation.Margins` of each joint sample of ``Q`` (S, 4)."""
     for i in range(Q.shape[0]):
         dense_margins(Q[i : i + 1], scene, out[i])
 

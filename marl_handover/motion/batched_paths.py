@@ -18,11 +18,11 @@ from marl_handover.cell import Cell
 from marl_handover.cell.build import CellModel
 from marl_handover.config import CentralisedConfig, MotionConfig
 from marl_handover.geometry.closed_form import planar_ik
-from marl_handover.motion.batched import Ends
-from marl_handover.motion.body import arm_body
-from marl_handover.motion.splines import sampled_basis
-from marl_handover.motion.starts import GRIP_LEAST_MM, RUN_UP_MM, SAMPLES, WRIST_LEAST_MM, sample_places
-from marl_handover.motion.ways import JOINTS
+from marl_handover.motion.batched_collision import Ends
+from marl_handover.motion.collision_model import arm_collision_model
+from marl_handover.motion.initial_guesses import GRIP_LEAST_MM, RUN_UP_MM, SAMPLES, WRIST_LEAST_MM
+from marl_handover.motion.splines import sample_places, sampled_basis
+from marl_handover.motion.transfer_features import JOINTS
 
 END_WEIGHT, END_WIDTH = 100.0, 0.08
 """How much more the ends of the straight guess weigh when few control points are fitted to it, and how far into the path.
@@ -51,7 +51,7 @@ class MotionNumbers:
     """
 
     def __init__(self, model: CellModel, motion: MotionConfig, settings: CentralisedConfig) -> None:
-        body = arm_body(model, motion)
+        body = arm_collision_model(model, motion)
         self.settings, self.motion = settings, motion
         self.planar = model.arm.planar
         self.pick_height_mm = float(model.cell.config.pick_height_mm)
@@ -86,7 +86,7 @@ class MotionNumbers:
     def straight(self, ends: Ends, joints: Tensor) -> Tensor:
         """Inner control points (n, N - 2, 4) of the executors' straight first guess: up, along the line over the table, and down.
 
-        The batched twin of the first of :func:`marl_handover.motion.starts.carrying_starts`, fitted with weights.
+        The batched twin of the first of :func:`marl_handover.motion.initial_guesses.carrying_guesses`, fitted with weights.
         """
         device = joints.device
         t = self.along.to(device)

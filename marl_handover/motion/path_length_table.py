@@ -52,7 +52,7 @@ class StaleTable(HandoverError):
 
 
 @dataclass(frozen=True, eq=False)
-class CostTable:
+class PathLengthTable:
     """A :data:`~marl_handover.task.rules.MotionCost`: lengths in mm of the grip's way, numpy or torch, float32 or float64.
 
     Attributes:
@@ -136,13 +136,13 @@ def motion_cost(cell: Cell, task: TaskConfig, motion: MotionConfig | None = None
 
     A cell other than the shipped one has its table built at first use, in about a minute, and kept in the user's cache folder.
     """
-    return straight_line_mm if task.reward.motion_weight == 0 else cost_table(cell, motion or MotionConfig())
+    return straight_line_mm if task.reward.motion_weight == 0 else path_length_table(cell, motion or MotionConfig())
 
 
-_TABLES: dict[str, CostTable] = {}
+_TABLES: dict[str, PathLengthTable] = {}
 
 
-def cost_table(cell: Cell, motion: MotionConfig) -> CostTable:
+def path_length_table(cell: Cell, motion: MotionConfig) -> PathLengthTable:
     """The table of a cell: the shipped one, one kept from before, or a new one."""
     key = settings_key(cell, motion)
     if key not in _TABLES:
@@ -150,7 +150,7 @@ def cost_table(cell: Cell, motion: MotionConfig) -> CostTable:
     return _TABLES[key]
 
 
-def known_table(cell: Cell, motion: MotionConfig) -> CostTable | None:
+def known_table(cell: Cell, motion: MotionConfig) -> PathLengthTable | None:
     """The table of a cell, if it is shipped or was kept from before; nothing is built."""
     return _found(settings_key(cell, motion))
 
@@ -169,7 +169,7 @@ def settings_key(cell: Cell, motion: MotionConfig) -> str:
     return digest.hexdigest()[:16]
 
 
-def read_table(path: Path, key: str) -> CostTable:
+def read_table(path: Path, key: str) -> PathLengthTable:
     """The table stored in ``path``, if it is the one of settings ``key``.
 
     Raises:
@@ -181,7 +181,7 @@ def read_table(path: Path, key: str) -> CostTable:
         with np.load(path, allow_pickle=False) as file:
             stored = str(file["key"])
             radii, string, excess = (np.asarray(file[name], float) for name in ("radii_mm", "string_mm", "excess_mm"))
-            table = CostTable(stored, radii, float(file["span_rad"]), string, excess)
+            table = PathLengthTable(stored, radii, float(file["span_rad"]), string, excess)
     except Exception as error:  # numpy and zip raise many kinds
         raise CorruptFile("path costs", path, "damaged, or no such table; delete it and it is built again") from error
     if stored != key:
@@ -192,7 +192,7 @@ def read_table(path: Path, key: str) -> CostTable:
     return table
 
 
-def build_table(cell: Cell, motion: MotionConfig, *, progress: bool = True) -> CostTable:
+def build_table(cell: Cell, motion: MotionConfig, *, progress: bool = True) -> PathLengthTable:
     """Plan a transfer for every node, both places symmetric about the middle of the yaw range, the other arm parked.
 
     A node without a path gets the largest excess found at all: it is to be dear, not free.
@@ -215,8 +215,8 @@ def build_table(cell: Cell, motion: MotionConfig, *, progress: bool = True) -> C
     distances = np.linspace(0.0, 2 * cell.r_max_mm, DISTANCES)
     turns = 2 * np.arcsin(np.minimum(distances / (2 * cell.r_max_mm), math.sin(span / 2)))
     chords = [_places(cell, middle, cell.r_max_mm, cell.r_max_mm, turn) for turn in turns]
-    string = np.array([planner.carrying(0, *ends, planner.parked_rad)[0].lower_bound_mm for ends in chords])
-    return CostTable(settings_key(cell, motion), np.array([cell.r_min_mm, cell.r_max_mm]), span, string, excess)
+    string = np.array([planner.carrying(0, *ends, planner.home_rad)[0].lower_bound_mm for ends in chords])
+    return PathLengthTable(settings_key(cell, motion), np.array([cell.r_min_mm, cell.r_max_mm]), span, string, excess)
 
 
 def _places(cell: Cell, middle_rad: float, first_mm: float, second_mm: float, between_rad: float) -> tuple[Floats, Floats]:
@@ -227,10 +227,10 @@ def _places(cell: Cell, middle_rad: float, first_mm: float, second_mm: float, be
 
 def _excess_mm(planner: Any, pick_mm: Floats, place_mm: Floats) -> float:
     """What the shortest path found from all starts is longer than the string; NaN without a path."""
-    from marl_handover.motion.segment import NoPath, find_path
+    from marl_handover.motion.path_optimizer import NoPath, find_path
 
     motion = planner.motion
-    segment, guesses = planner.carrying(0, pick_mm, place_mm, planner.parked_rad)
+    segment, guesses = planner.carrying(0, pick_mm, place_mm, planner.home_rad)
     try:
         found = find_path(segment, guesses, motion.control_points, motion.degree, motion.starts, thorough=True)
     except NoPath:
@@ -238,7 +238,7 @@ def _excess_mm(planner: Any, pick_mm: Floats, place_mm: Floats) -> float:
     return found.length_mm - segment.lower_bound_mm
 
 
-def _found(key: str) -> CostTable | None:
+def _found(key: str) -> PathLengthTable | None:
     """The shipped table, or one in the cache folder."""
     for path in (package_path(SHIPPED), cache_file(key)):
         try:
@@ -248,7 +248,7 @@ def _found(key: str) -> CostTable | None:
     return None
 
 
-def _kept(cell: Cell, motion: MotionConfig, key: str) -> CostTable:
+def _kept(cell: Cell, motion: MotionConfig, key: str) -> PathLengthTable:
     """A new table, kept in the cache folder if that can be written."""
     table, path = build_table(cell, motion), cache_file(key)
     try:

@@ -14,7 +14,7 @@ JOINTS = 4
 """Numbers of a control point: base yaw, shoulder, elbow, wrist pitch."""
 
 
-def way_features(cell: Cell, arm: Array, from_mm: Array, to_mm: Array, fold: bool) -> tuple[Array, Array]:
+def transfer_features(cell: Cell, arm: Array, from_mm: Array, to_mm: Array, fold: bool) -> tuple[Array, Array]:
     """Features (..., 8) of ways between world positions (..., 2) as the arms (...) see them, and the sign (...) of their base yaw.
 
     ``fold``: M_x mirrors an arm's own frame, so a way that turns right is seen as its image, which turns left; the sign is then -1, and

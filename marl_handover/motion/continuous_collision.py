@@ -13,10 +13,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marl_handover.motion.scene import Scene
-from marl_handover.motion.segment import Segment
+from marl_handover.motion.collision_model import Scene
+from marl_handover.motion.path_optimizer import Segment
 from marl_handover.motion.splines import knots
-from marl_handover.motion.verify import dense_margins
+from marl_handover.motion.validation import dense_margins
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -46,7 +46,7 @@ def certify(segment: Segment, points: Floats, degree: int) -> Certificate:
     slopes = degree * np.diff(points, axis=0) / (vector[degree + 1 : -1] - vector[1 : -degree - 1])[:, None]
     inner = vector[degree : len(points) + 1]
     fastest = np.stack([np.abs(slopes[span : span + degree]).max(axis=0) for span in range(len(inner) - 1)])
-    margin, looks = _prove(points, degree, vector, inner, fastest @ segment.body.levers_mm, segment.scene)
+    margin, looks = _prove(points, degree, vector, inner, fastest @ segment.collision_model.levers_mm, segment.scene)
     return Certificate(float(margin), bool(margin >= 0.0), int(looks))
 
 

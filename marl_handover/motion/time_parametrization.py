@@ -20,16 +20,15 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.config import require_at_least, require_between, require_positive
 from marl_handover.errors import InvalidSetting, NotFinite
-from marl_handover.motion.spline_kernels import STILL, spline, still_spans, turns
 from marl_handover.motion.splines import knots
-from marl_handover.motion.timing_kernels import fastest, time_law
+from marl_handover.motion.time_parametrization_kernels import STILL, fastest, spline, still_spans, time_law, turns
+from marl_handover.motion.trajectory import JointTrajectory
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -43,14 +42,6 @@ _ROUNDS = 2  # of checking between the grid points
 _LARGEST_RAD = 1e6  # beyond, squares of rounding errors would be felt
 
 
-class TimedPath(NamedTuple):
-    """A path with its time law: ``t_s`` (n,) from 0 at even intervals, ``joints_rad`` (n, 5) and ``velocities_rad_s`` (n, 5)."""
-
-    t_s: Floats
-    joints_rad: Floats
-    velocities_rad_s: Floats
-
-
 def time_path(
     control_points: ArrayLike,
     degree: int,
@@ -58,7 +49,7 @@ def time_path(
     acceleration_rad_s2: ArrayLike,
     sample_s: float,
     grid: int = GRID,
-) -> TimedPath:
+) -> JointTrajectory:
     """The fastest motion along a path, from rest to rest.
 
     Args:
@@ -83,7 +74,7 @@ def time_path(
     require_positive("sample_s", sample_s)
     require_at_least("grid", grid, 2)
     if np.ptp(points, axis=0).max() <= STILL:
-        return TimedPath(np.array([0.0, sample_s]), points[[0, -1]], np.zeros((2, points.shape[1])))
+        return JointTrajectory(np.array([0.0, sample_s]), points[[0, -1]], np.zeros((2, points.shape[1])))
     knot, widths_1, widths_2 = _knots_and_widths(len(points), degree)
     first = np.diff(points / acceleration, axis=0) / widths_1
     second = np.diff(first, axis=0) / widths_2
@@ -99,7 +90,7 @@ def time_path(
     velocities = spline(first, knot[1:-1], degree - 1, tau) * acceleration * tau_rate[:, None]
     joints[0], joints[-1] = points[0], points[-1]
     velocities[0] = velocities[-1] = 0.0
-    return TimedPath(t, joints, velocities)
+    return JointTrajectory(t, joints, velocities)
 
 
 def _checked_points(control_points: ArrayLike, degree: int) -> Floats:

@@ -1,4 +1,4 @@
-"""The check of a motion for thousands of transfers at once, in torch: that of :mod:`marl_handover.motion.verify`, at fewer samples.
+"""The check of a motion for thousands of transfers at once, in torch: that of :mod:`marl_handover.motion.validation`, at fewer samples.
 
 The same bodies, pairs, clearances and lower edges of the held block, judged at a fixed number of samples of the path of the loaded hand,
 the other arm parked. What is not asked is the executors' lift-over profile: how high a block travels is a taste, not a collision.
@@ -18,17 +18,16 @@ from marl_handover.cell.build import CellModel
 from marl_handover.config import CentralisedConfig, MotionConfig
 from marl_handover.geometry.capsules import segment_distance
 from marl_handover.geometry.closed_form import pitch_frames
-from marl_handover.motion.body import out_of_reach
+from marl_handover.motion.collision_model import out_of_reach
 from marl_handover.motion.objective import first_moving
 from marl_handover.motion.planner import STILL_MM, MotionPlanner
-from marl_handover.motion.splines import basis
-from marl_handover.motion.starts import sample_places
+from marl_handover.motion.splines import basis, sample_places
 
 CHUNK = 1024
 """Rows judged together: their samples stay in the processor's cache."""
 
 CROWDING = 0.6
-"""Samples are denser towards both ends, where a block is near the table; see :func:`marl_handover.motion.starts.sample_places`."""
+"""Samples are denser towards both ends, where a block is near the table; see :func:`marl_handover.motion.initial_guesses.sample_places`."""
 
 ROUNDING_MM = 0.03
 """A block on the table may be this much in it: single precision, and poses at the edge of the reach, which are some 20 um off."""
@@ -91,14 +90,14 @@ class MotionCheck:
 
     def __init__(self, model: CellModel, motion: MotionConfig, settings: CentralisedConfig) -> None:
         planner = MotionPlanner(model, motion)
-        body = planner.body
+        body = planner.collision_model
         self.motion = motion
         self.planar, self.capsules, self.edges = body.planar, body.held, body.edges
         self.carried, self.first = len(body.capsules), int(first_moving(body.held))
         self.pairs = [(int(one), int(other)) for one, other in body.held_pairs]
         self.link_balls = self._balls_of_links()
         # What the planner sets around the path of a loaded hand; the middle of the shared space is in every arm's reach.
-        scenes = [planner.carrying(arm, np.zeros(2), np.zeros(2), planner.parked_rad)[0].scene for arm in range(model.cell.num_arms)]
+        scenes = [planner.carrying(arm, np.zeros(2), np.zeros(2), planner.home_rad)[0].scene for arm in range(model.cell.num_arms)]
         others = np.stack([scene.obstacles for scene in scenes])
         others = others[:, ~np.all([out_of_reach(body, rows) for rows in others], axis=0)]
         self.constants = {

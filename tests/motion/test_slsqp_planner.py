@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marl_handover.cell import build_cell, cell_config
-from marl_handover.motion.paper_method import first_guess, grip_speed, plan_paper, sample_margins, solve
+from marl_handover.motion.path_optimizer import NoPath, Segment
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.segment import NoPath, Segment
+from marl_handover.motion.slsqp_planner import first_guess, grip_speed, plan_slsqp, sample_margins, solve
 from marl_handover.motion.splines import evaluate
 
 TAU = np.linspace(0.0, 1.0, 1001)
@@ -21,7 +21,7 @@ def planner() -> MotionPlanner:
 
 def carrying(planner: MotionPlanner, pick: tuple[float, float], place: tuple[float, float], other: np.ndarray | None = None) -> Segment:
     """A transfer of the right arm, the left one parked if nothing else is said."""
-    segment, _ = planner.carrying(1, np.array(pick), np.array(place), planner.parked_rad if other is None else other)
+    segment, _ = planner.carrying(1, np.array(pick), np.array(place), planner.home_rad if other is None else other)
     return segment
 
 
@@ -32,7 +32,7 @@ TRANSFERS = [((-110.0, -50.0), (90.0, -10.0)), ((40.0, 0.0), (-60.0, -20.0))]
 def test_its_path_holds_what_the_paper_demands(planner, pick, place):
     """Poses at both ends by the arm model's own kinematics, limits, and the dense check within a millimetre."""
     segment = carrying(planner, pick, place)
-    found = plan_paper(segment, tolerance_mm=1.0)
+    found = plan_slsqp(segment, tolerance_mm=1.0)
     assert found.points.shape == (7, 5)
     assert found.starts == 1
     assert found.evaluations > 1
@@ -54,17 +54,17 @@ def test_its_path_holds_what_the_paper_demands(planner, pick, place):
 def test_it_makes_its_first_guess_shorter_or_feasible(planner):
     segment = carrying(planner, *TRANSFERS[0])
     margins, length = segment.check(np.ascontiguousarray(evaluate(first_guess(segment), TAU, 5)[:, :4]))
-    found = plan_paper(segment, tolerance_mm=1.0)
+    found = plan_slsqp(segment, tolerance_mm=1.0)
     assert margins.worst < -5.0 or found.length_mm < length
 
 
 def test_without_tolerance_it_is_judged_like_any_other_path(planner):
     """What the program holds at its samples only is short somewhere between them; the refusal says by how much."""
     segment = carrying(planner, (-200.0, -180.0), (200.0, -175.0))
-    margins = plan_paper(segment, tolerance_mm=1.0).margins
+    margins = plan_slsqp(segment, tolerance_mm=1.0).margins
     assert -1.0 < margins.worst < 0.0
     with pytest.raises(NoPath, match="1001 samples") as refused:
-        plan_paper(segment)
+        plan_slsqp(segment)
     assert refused.value.reason == "path"
     assert refused.value.shortfall_mm == pytest.approx(-margins.worst)
 
@@ -73,7 +73,7 @@ def test_too_few_iterations_are_no_path(planner):
     segment = carrying(planner, *TRANSFERS[0])
     assert solve(segment, maxiter=2)[1] == 2
     with pytest.raises(NoPath) as refused:
-        plan_paper(segment, maxiter=1, tolerance_mm=1.0)
+        plan_slsqp(segment, maxiter=1, tolerance_mm=1.0)
     assert refused.value.reason == "path"
 
 
@@ -81,7 +81,7 @@ def test_an_end_that_is_too_near_the_other_arm_is_refused_before_the_search(plan
     """The left arm grasps where the right one is to place."""
     other = planner.grasp_joints(0, "place", np.array([90.0, -10.0]))
     with pytest.raises(NoPath) as refused:
-        plan_paper(carrying(planner, *TRANSFERS[0], other))
+        plan_slsqp(carrying(planner, *TRANSFERS[0], other))
     assert refused.value.reason == "end"
 
 

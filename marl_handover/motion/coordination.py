@@ -15,13 +15,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marl_handover.geometry.kernels import FAR_MM, beyond, nearest, world_shapes
+from marl_handover.geometry.kernels import FAR_MM, broad_phase, closest_points, world_shapes
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.trajectory import Phase, TransferMotion
+from marl_handover.motion.trajectory import LOADED_PHASES, Phase, TransferMotion
 
 Floats = NDArray[np.float64]
 
-LOADED = ("lift", "transfer", "lower", "release")
+WITH_BLOCK = (*LOADED_PHASES, "release")
 """Phases in which the block is counted as part of the arm."""
 
 
@@ -38,7 +38,7 @@ class Schedule(NamedTuple):
         return 1.0 - self.overlapped_s / self.sequential_s if self.sequential_s else 0.0
 
 
-def overlapped(planner: MotionPlanner, motions: Sequence[TransferMotion]) -> Schedule:
+def coordinate(planner: MotionPlanner, motions: Sequence[TransferMotion]) -> Schedule:
     """The earliest starts of cycles that follow each other.
 
     A cycle of the same arm starts when the one before has ended. A cycle of the other arm may start earlier, as long as the arms keep
@@ -104,11 +104,11 @@ def _placed(planner: MotionPlanner, motion: TransferMotion, step: float) -> tupl
     joints = np.stack([np.interp(times, t, q[:, joint]) for joint in range(4)], axis=-1)
     names = np.array([phase.name for phase in phases])
     at = np.searchsorted([phase.t_s[-1] for phase in phases], times - 1e-9).clip(max=len(phases) - 1)
-    bare, held = len(planner.body.capsules), len(planner.body.held)
-    counts = np.where(np.isin(names[at], LOADED), held, bare)
+    bare, held = len(planner.collision_model.capsules), len(planner.collision_model.held)
+    counts = np.where(np.isin(names[at], WITH_BLOCK), held, bare)
     base = planner.model.cell.bases[motion.arm]
-    shapes = world_shapes(joints, planner.body.planar, planner.body.held, base.x_mm, base.y_mm, base.facing_rad)
-    moves = np.abs(np.diff(joints, axis=0)) @ planner.body.levers_mm
+    shapes = world_shapes(joints, planner.collision_model.planar, planner.collision_model.held, base.x_mm, base.y_mm, base.facing_rad)
+    moves = np.abs(np.diff(joints, axis=0)) @ planner.collision_model.levers_mm
     return shapes, counts, np.maximum(np.append(moves, 0.0), np.append(0.0, moves))
 
 
@@ -126,7 +126,7 @@ def _clearances(first: Floats, counts: NDArray[np.int64], second: Floats, others
             for a in range(counts[i]):
                 for b in range(others[j]):
                     need = A[a, 10] + B[b, 10]
-                    if not beyond(A, a, B, b, need + least):
-                        least = min(least, nearest(A, a, B, b, point) - need)
+                    if not broad_phase(A, a, B, b, need + least):
+                        least = min(least, closest_points(A, a, B, b, point) - need)
             out[i, j] = least
     return out

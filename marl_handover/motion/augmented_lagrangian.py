@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marl_handover.motion.objective import LEVER_MM, Price, columns, lagrangian
-from marl_handover.motion.scene import Scene
+from marl_handover.motion.collision_model import Scene
+from marl_handover.motion.objective import LEVER_MM, Penalty, columns, lagrangian
 
 Floats = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ class Spline(NamedTuple):
     limits: Floats
 
 
-class Effort(NamedTuple):
+class SolverOptions(NamedTuple):
     """How long the descent tries: first penalty per mm, its growth a round, rounds, steps a round, relative gain that ends a round,
     violation in mm that is good enough.
     """
@@ -42,14 +42,14 @@ class Effort(NamedTuple):
     slack_mm: float
 
 
-class Held(NamedTuple):
+class Multipliers(NamedTuple):
     """Multipliers: ``lam`` (S, C) of the samples' constraints, ``limit`` (n, 4, 2) of the joint limits."""
 
     lam: Floats
     limit: Floats
 
 
-class Sampled(NamedTuple):
+class Evaluation(NamedTuple):
     """What an evaluation fills: joint samples (S, 4), their gradient (S, 4), constraints (S, C)."""
 
     Q: Floats
@@ -58,38 +58,46 @@ class Sampled(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def descend(points: Floats, spline: Spline, scene: Scene, weights: Floats, effort: Effort) -> tuple[Floats, float, int]:
+def minimize(points: Floats, spline: Spline, scene: Scene, weights: Floats, options: SolverOptions) -> tuple[Floats, float, int]:
     """Improve control points (N, 4), ends fixed.
 
     Returns:
         the control points, the greatest violation in mm at the samples, the number of evaluations of cost and gradient.
     """
     S, n, C = spline.B.shape[0], points.shape[0] - 2, columns(scene)
-    held = Held(np.zeros((S, C)), np.zeros((n, 4, 2)))
-    now = Sampled(np.empty((S, 4)), np.empty((S, 4)), np.empty((S, C)))
-    x, rho, evaluations, before, worst = points.copy(), effort.penalty, 0, np.inf, np.inf
+    held = Multipliers(np.zeros((S, C)), np.zeros((n, 4, 2)))
+    now = Evaluation(np.empty((S, 4)), np.empty((S, 4)), np.empty((S, C)))
+    x, rho, evaluations, before, worst = points.copy(), options.penalty, 0, np.inf, np.inf
     H = spline.metric.copy()
-    for _ in range(effort.rounds):
-        x, cost, used = _minimise(x, rho, held, now, spline, scene, weights, effort, H)
+    for _ in range(options.rounds):
+        x, cost, used = _minimise(x, rho, held, now, spline, scene, weights, options, H)
         evaluations += used
-        worst, paid = _take_over(x, now.values, held, rho, spline.limits)
+        worst, paid = _update_multipliers(x, now.values, held, rho, spline.limits)
         cost -= paid
-        if worst <= effort.slack_mm and abs(before - cost) < 2e-3 * cost:
+        if worst <= options.slack_mm and abs(before - cost) < 2e-3 * cost:
             break
         before = cost
-        rho *= effort.growth
+        rho *= options.growth
     return x, worst, evaluations
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _minimise(
-    x: Floats, rho: float, held: Held, now: Sampled, spline: Spline, scene: Scene, weights: Floats, effort: Effort, H: Floats
+    x: Floats,
+    rho: float,
+    held: Multipliers,
+    now: Evaluation,
+    spline: Spline,
+    scene: Scene,
+    weights: Floats,
+    options: SolverOptions,
+    H: Floats,
 ) -> tuple[Floats, float, int]:
     """One round of BFGS at fixed multipliers; ``now`` ends as the evaluation of what is returned, ``H`` goes on to the next round."""
     n = x.shape[0] - 2
     f, g = _evaluate(x, rho, held, now, spline, scene, weights)
     evaluations = 1
-    for _ in range(effort.steps):
+    for _ in range(options.steps):
         d = -_times(H, g)
         slope = np.dot(d, g)
         if slope > -1e-9:
@@ -112,7 +120,7 @@ def _minimise(
         _update(H, scale * d, gn - g)
         gain = f - fn
         x, f, g = xn, fn, gn
-        if gain < effort.gain * abs(f):
+        if gain < options.gain * abs(f):
             break
     return x, f, evaluations
 
@@ -131,7 +139,9 @@ def _update(H: Floats, s: Floats, y: Floats) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _evaluate(x: Floats, rho: float, held: Held, now: Sampled, spline: Spline, scene: Scene, weights: Floats) -> tuple[float, Floats]:
+def _evaluate(
+    x: Floats, rho: float, held: Multipliers, now: Evaluation, spline: Spline, scene: Scene, weights: Floats
+) -> tuple[float, Floats]:
     """The augmented Lagrangian at control points ``x`` (N, 4) and its gradient over the inner ones, flat."""
     B, limits, Q, grad, limit = spline.B, spline.limits, now.Q, now.grad, held.limit
     S, n = B.shape[0], x.shape[0] - 2
@@ -142,7 +152,7 @@ def _evaluate(x: Floats, rho: float, held: Held, now: Sampled, spline: Spline, s
             for k in range(n + 2):
                 total += B[i, k] * x[k, j]
             Q[i, j] = total
-    f = lagrangian(Q, scene, Price(held.lam, rho, spline.step, weights), grad, now.values)
+    f = lagrangian(Q, scene, Penalty(held.lam, rho, spline.step, weights), grad, now.values)
     g = np.zeros((n, 4))
     for i in range(S):
         for k in range(n):
@@ -169,7 +179,7 @@ def _times(H: Floats, v: Floats) -> Floats:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _take_over(x: Floats, values: Floats, held: Held, rho: float, limits: Floats) -> tuple[float, float]:
+def _update_multipliers(x: Floats, values: Floats, held: Multipliers, rho: float, limits: Floats) -> tuple[float, float]:
     """Take over the multipliers; the greatest violation in mm, and what the penalty was."""
     worst, paid, lam, limit = 0.0, 0.0, held.lam, held.limit
     for i in range(values.shape[0]):
