@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -77,8 +76,7 @@ def _try_out(policy: SupervisorPolicy) -> None:
     """Ask a policy for two decisions, so that what cannot act is refused when it is loaded. Raises whatever that raises."""
     cell = policy.rules.cell
     middle_mm = (cell.r_min_mm + cell.r_max_mm) / 2
-    ahead = [[base.x_mm + middle_mm * math.cos(base.facing_rad), middle_mm * math.sin(base.facing_rad), 0.0] for base in cell.bases]
-    pose = np.array(ahead)
+    pose = np.array([[*base.to_world([middle_mm, 0.0]), 0.0] for base in cell.bases])
     with np.errstate(all="ignore"):
         action = policy.act(pose, pose[::-1], np.arange(len(pose)) - 1)
     size = policy.rules.action_size
