@@ -1,8 +1,11 @@
 """The browser page in numbers: how soon a drag is followed, how many updates every viewer gets, how much memory it takes in the long run.
 
 python bench/viewer.py drags=300 viewers=4 seconds=20 steps=10000 minutes=10 policy=exact results=bench/results
+python bench/viewer.py crowd=1500 crowd_seconds=120
 
-The viewers are programs that speak viser's protocol, in this process; the page is served by another one, ``marl-handover view``.
+The second line measures something else: one viewer of each page, while so many sockets connect, read nothing, and connect again some
+seconds after they are let go. The viewers are programs that speak viser's protocol, in this process; the page is served by another one,
+``marl-handover view``.
 """
 
 from __future__ import annotations
@@ -11,23 +14,33 @@ import contextlib
 import datetime
 import io
 import json
+import math
+import multiprocessing
 import os
+import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import numpy as np
+import viser
 from common import ROOT, commit, machine, parse, table
 from viewer_client import Client
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from marl_handover import cli
-from marl_handover.cell import load_cell
+from marl_handover.cell import cell_config, load_cell
+from marl_handover.files import write_whole
+from marl_handover.runtime.feed import FORMAT, STATE_FILE, VERSION
 from marl_handover.viewer.units import flat
 
 DEFAULTS = {
@@ -39,9 +52,12 @@ DEFAULTS = {
     "policy": "exact",
     "seed": 0,
     "results": "bench/results",
+    "crowd": 0,
+    "crowd_seconds": 120,
 }
 LIMIT_MS, LIMIT_HZ = 100.0, 20.0
 SCRUB_HZ = 30.0
+AGAIN_S = 5.0
 UPDATE_S = 1 / 60
 """What comes within this is one update: the server sends no more often."""
 
@@ -64,7 +80,7 @@ def watched(address: str, viewers: int) -> Iterator[list[Client]]:
     with contextlib.ExitStack() as stack:
         clients = [stack.enter_context(Client(address)) for _ in range(viewers)]
         for client in clients:
-            client.wait(lambda client=client: "position" in client.nodes.get("/goal", {}), 60)  # type: ignore[misc]
+            client.wait(lambda client=client: any("position" in node for node in client.nodes.values()), 60)  # type: ignore[misc]
         yield clients
 
 
@@ -150,8 +166,120 @@ def in_the_long_run(pages: list[tuple[str, int]], viewers: int, minutes: float, 
     return seen
 
 
+def connected(port: int) -> socket.socket:
+    """A viewer's socket, on its way."""
+    stream = socket.socket()
+    stream.setblocking(False)
+    stream.connect_ex(("127.0.0.1", port))
+    return stream
+
+
+def press(port: int, count: int, ended: Any) -> None:
+    """``count`` sockets, in a process of its own: every one is a viewer that reads nothing, and comes again when it is let go."""
+    headers = ("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==")
+    lines = ("GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", *headers, f"Sec-WebSocket-Protocol: viser-v{viser.__version__}", "", "")
+    asked = "\r\n".join(lines).encode()
+    streams = {connected(port): False for _ in range(count)}
+    away: deque[float] = deque()
+    """Times at which those who were let go come again."""
+    while not ended.wait(0.1):
+        for stream, greeted in list(streams.items()):
+            try:
+                if not greeted:
+                    stream.sendall(asked)
+                    streams[stream] = True
+                elif not stream.recv(12, socket.MSG_PEEK).endswith(b"101"):
+                    raise ConnectionResetError
+            except BlockingIOError:
+                continue
+            except OSError:
+                stream.close()
+                del streams[stream]
+                away.append(time.monotonic() + AGAIN_S)
+        while away and away[0] < time.monotonic():
+            away.popleft()
+            streams[connected(port)] = False
+
+
+@contextlib.contextmanager
+def crowded(address: str, count: int) -> Iterator[None]:
+    """Meanwhile a crowd presses."""
+    ended = multiprocessing.Event()
+    process = multiprocessing.Process(target=press, args=(int(address.rsplit(":", 1)[1]), count, ended))
+    process.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        process.join()
+
+
+@contextlib.contextmanager
+def session(folder: Path) -> Iterator[None]:
+    """What a session with two moving arms publishes in ``folder``, some 50 times a second."""
+    ended = threading.Event()
+    cell = asdict(cell_config("paper"))
+    fixed = {"format": FORMAT, "version": VERSION, "session": "bench", "pid": os.getpid(), "over": False, "view_control": False}
+    fixed |= {"doing": "moving", "text": "", "phase": "transfer", "cell": cell, "host": os.uname().nodename}
+
+    def publish() -> None:
+        while not ended.wait(0.02):
+            now = time.time()
+            arms = [{"joints_rad": [0.3 * np.sin(now), 1.0, -1.0, 0.0, 0.0], "gripper_mm": None, "holding": False} for _ in range(2)]
+            write_whole(folder / STATE_FILE, json.dumps(fixed | {"time": now, "quiet_s": 0.0, "arms": arms}))
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def wait_for_a_place(address: str) -> float:
+    """The time in s until one more viewer is let in among the crowd."""
+    begun = time.perf_counter()
+    while time.perf_counter() < begun + 60.0:
+        with contextlib.suppress(OSError, InvalidHandshake, ConnectionClosed), Client(address) as client:
+            client.wait(lambda: bool(client.frames), 10)
+            return time.perf_counter() - begun
+        time.sleep(0.1)
+    return math.inf
+
+
+def crowds(settings: dict[str, Any]) -> dict[str, Any]:
+    """One viewer's updates a second, the new viewer's wait in s and the memory in MB of every page, while a crowd presses."""
+    rows: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        live = folder / "live"
+        live.mkdir()
+        trace = long_trace(folder, settings["steps"])
+        pages = {"play": (f"policy={settings['policy']}",), "trace": (f"trace={trace}",), "live": (f"live={live}",)}
+        for what, arguments in pages.items():
+            with contextlib.ExitStack() as stack:
+                if what == "live":
+                    stack.enter_context(session(live))
+                address, pid = stack.enter_context(page(*arguments))
+                (viewer,) = stack.enter_context(watched(address, 1))
+                if what == "trace":
+                    viewer.set("play", True)
+                memory = [memory_mb(pid)]
+                with crowded(address, settings["crowd"]):
+                    hz = updates([viewer], settings["crowd_seconds"])[0]
+                    memory.append(memory_mb(pid))
+                    wait_s = wait_for_a_place(address)
+                rows[what] = {"updates_hz": hz, "memory_mb": memory, "new_viewer_s": wait_s, "alive": Path(f"/proc/{pid}").exists()}
+                print(what, rows[what], flush=True)
+    return rows
+
+
 def main(arguments: list[str]) -> None:
     settings = parse(arguments, DEFAULTS)
+    if settings["crowd"]:
+        crowds(settings)
+        return
     results: dict[str, Any] = {"settings": settings, "machine": machine(1), "commit": commit()}
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
         trace = long_trace(Path(name), settings["steps"])

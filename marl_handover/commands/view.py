@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 MODES = ("play", "trace", "live")
 SHIPPED = ("exact", "pretrained_b", "pretrained_a")
-LIVE_HZ = 20.0
+LIVE_HZ = 30.0
 UNUSED: dict[str, tuple[str, ...]] = {"play": (), "trace": ("policy", "seed"), "live": ("policy", "seed", "speed", "task", "motion")}
 """Keys that mean nothing in a mode."""
 

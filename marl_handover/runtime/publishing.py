@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from marl_handover.runtime.loop import ClosedLoop
     from marl_handover.runtime.portrait import Portrait
 
-PERIOD_S = 0.05
+PERIOD_S = 0.04
 """Between two state files, in wall time."""
 
 PICTURE_S = 0.2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import viser
@@ -22,3 +23,12 @@ def number(handle: Any, low: float, high: float) -> float:
 def write(handle: Any, value: object) -> None:
     """Set an input to ``value``; typed loosely, as type checkers take viser's ``value`` for read-only."""
     handle.value = value
+
+
+def at_once(act: Callable[[], object]) -> Callable[[Any], Coroutine[Any, Any, None]]:
+    """A callback that calls ``act`` in the server's own thread: it waits for no other callback. ``act`` has to be quick."""
+
+    async def act_now(_: object) -> None:
+        act()
+
+    return act_now

@@ -7,6 +7,7 @@ a :class:`~marl_handover.runtime.feed.Feed` asks for.
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections import deque
 from typing import Any
@@ -23,6 +24,7 @@ from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.runtime.feed import Feed, Reading
 from marl_handover.runtime.steering import MAX_AGE_S, Ask
 from marl_handover.viewer import live_words
+from marl_handover.viewer.inputs import at_once
 from marl_handover.viewer.scene import CellScene
 
 Floats = NDArray[np.float64]
@@ -57,17 +59,21 @@ class LivePage:
         self._stopping: tuple[float, str] | None = None
         self._asked: tuple[int, str, float] | None = None
         self._held: Floats | None = None
+        self._asking = threading.Lock()
         self._add_controls()
 
     def update(self, dt_s: float = 0.0) -> None:
-        """Show the newest state; to be called at most 20 times a second, from one thread. What cannot be shown is said."""
-        reading = self.feed.read()
+        """Show the newest state; to be called at most 30 times a second, from one thread. What cannot be shown is said."""
         failed = ""
+        try:
+            reading = self.feed.read()
+        except Exception as error:  # whatever a folder holds, the page with its STOP button has to stay
+            reading = Reading(None, False, f"the folder cannot be read: {type(error).__name__}: {error}", 0.0)
         with self.server.atomic():
             for part in (self._follow, self._look, self._show_state, self._tell):
                 try:
                     part(reading)
-                except Exception as error:  # whatever a folder holds, the page with its STOP button has to stay
+                except Exception as error:  # as above
                     failed = failed or f"the session's state cannot be shown: {type(error).__name__}: {error}"
             self._say("failure", self._failure, live_words.note(failed))
 
@@ -112,7 +118,7 @@ class LivePage:
             self._plan = gui.add_html("")
         with gui.add_folder("events, newest first"):
             self._log = gui.add_html("")
-        stop.on_click(lambda _: self.stop())
+        stop.on_click(at_once(self.stop))
         self._start.on_click(lambda _: self._ask(Ask.START))
         self._pause.on_click(lambda _: self._ask(Ask.PAUSE))
         self._send.on_click(lambda _: self._ask(Ask.GOAL))
@@ -124,11 +130,15 @@ class LivePage:
     def _ask(self, command: Ask) -> None:
         x_mm, y_mm, turn_deg = self._goal.value
         goal = [x_mm, y_mm, math.radians(turn_deg)] if command is Ask.GOAL else None
+        if not self._asking.acquire(blocking=False):
+            return  # somebody's request is being written; a viewer that asks without end fills no queue
         try:
             self._asked = (self.feed.ask(command, goal), str(command), time.monotonic())
             self._trouble = ""
         except HandoverError as error:
             self._trouble = str(error)
+        finally:
+            self._asking.release()
 
     def _begin(self, state: dict[str, Any]) -> None:
         """Maybe it has another cell."""

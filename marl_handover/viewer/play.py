@@ -16,7 +16,7 @@ from marl_handover.errors import HandoverError
 from marl_handover.policies import SupervisorPolicy
 from marl_handover.runtime.interactive.cell import InteractiveCell, Snapshot
 from marl_handover.viewer.handles import PlaneHandle
-from marl_handover.viewer.inputs import by_hand, number, write
+from marl_handover.viewer.inputs import at_once, by_hand, number, write
 from marl_handover.viewer.reach import within_reach
 from marl_handover.viewer.scene import CellScene
 from marl_handover.viewer.words import decision_words, plain, score_words, state_words
@@ -66,7 +66,7 @@ class PlayPage:
         self._said: dict[str, str] = {}
         self._stopped, self._stops = False, cell.stops
         self._over_s, self._trouble, self._decision = 0.0, "", ""
-        self._lock = threading.Lock()
+        self._wanted, self._loading = "", threading.Lock()
         self._add_controls(speed)
 
     def update(self, dt_s: float) -> None:
@@ -96,39 +96,44 @@ class PlayPage:
             self._numbers = gui.add_vector3("x, y [mm], turn [°]", (0.0, 0.0, 0.0), step=1.0)
         self._score = gui.add_markdown("")
         self._last = gui.add_markdown("")
-        stop.on_click(lambda _: self.cell.stop())
-        self._clear.on_click(lambda _: self.cell.clear())
-        self._pause.on_click(lambda _: self._toggle())
+        stop.on_click(at_once(self.cell.stop))
+        self._clear.on_click(at_once(self.cell.clear))
+        self._pause.on_click(at_once(self.cell.toggle))
         new.on_click(lambda _: self._renew())
         self._policy_choice.on_update(self._choose)
         self._numbers.on_update(self._enter)
-
-    def _toggle(self) -> None:
-        if self._said.get("pause") == "go on":
-            self.cell.resume()
-        else:
-            self.cell.pause()
 
     def _renew(self) -> None:
         self._done(self.cell.new_problem())
 
     def _choose(self, event: viser.GuiEvent[Any]) -> None:
-        """Another policy, from a thread of the server's."""
+        """Another policy, from a thread of the server's. One thread loads; what is chosen meanwhile waits, the newest only."""
         if not by_hand(event):
             return
-        with self._lock:
-            name, stops = str(self._policy_choice.value), self.cell.stops
+        self._wanted = str(self._policy_choice.value)
+        while self._wanted and self._loading.acquire(blocking=False):
             try:
-                require_choice("policy", name, self._names)
-                policy = self._load(name)
-                taken = self.cell.stops == stops and self.cell.set_policy(policy)
-            except HandoverError as error:
-                self._trouble, taken = str(error), False
-            if taken:
-                self._policy, self._chosen = policy, name
-            else:
-                write(self._policy_choice, self._chosen)
-            self._done(taken)
+                self._take_policy()
+            finally:
+                self._loading.release()
+
+    def _take_policy(self) -> None:
+        """Load the policy that is wanted, and play with it."""
+        name, self._wanted = self._wanted, ""
+        if not name:
+            return
+        stops = self.cell.stops
+        try:
+            require_choice("policy", name, self._names)
+            policy = self._load(name)
+            taken = self.cell.stops == stops and self.cell.set_policy(policy)
+        except HandoverError as error:
+            self._trouble, taken = str(error), False
+        if taken:
+            self._policy, self._chosen = policy, name
+        else:
+            write(self._policy_choice, self._chosen)
+        self._done(taken)
 
     def _enter(self, event: viser.GuiEvent[Any]) -> None:
         """A goal in numbers."""

@@ -147,6 +147,13 @@ def test_what_a_session_says_is_text_and_no_page(page, session, tmp_path):
     assert not any("<script" in handle.content for handle in handles)
 
 
+def test_a_folder_whose_reading_fails_is_told_and_the_page_stays(page, session, monkeypatch):
+    page.show_state(session.states[-1])
+    monkeypatch.setattr(page.feed, "read", lambda: [][0])
+    page.update()
+    assert "IndexError" in page._headline.content
+
+
 def test_the_log_keeps_its_tail(page, session, tmp_path):
     page.show_state(session.states[-1])
     (tmp_path / EVENTS_FILE).write_text("".join(f'{{"t_s": {t}, "event": "resumed"}}\n' for t in range(100)))

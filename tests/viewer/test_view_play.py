@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from viewer_client import Client
+from viser import _messages
 
 from marl_handover import policies
 from marl_handover.runtime.interactive.cell import InteractiveCell
@@ -128,6 +129,42 @@ def test_stop_freezes_everything_and_what_is_asked_for_before_it_is_cleared_is_n
     np.testing.assert_allclose(shown, (*frozen.goal[:2], math.degrees(frozen.goal[2])), atol=0.051)
     viewer.set("go on", True)
     viewer.wait(lambda: "STOPPED" not in viewer.text() and "Paused" not in viewer.text(), SEEN_S)
+
+
+def test_after_a_stop_is_cleared_one_click_goes_on_also_when_the_button_still_says_pause(viewer, cell):
+    viewer.set("STOP", True)
+    viewer.wait(lambda: "STOPPED" in viewer.text(), SEEN_S)
+    button = viewer.input("pause")
+    stopped_s = cell.last.t_s
+    viewer.set("clear the stop", True)
+    viewer.send(_messages.GuiUpdateMessage(button, {"value": True}))
+    viewer.wait(lambda: cell.last.t_s > stopped_s, SEEN_S)
+
+
+def test_of_policies_chosen_while_one_is_loaded_the_newest_only_is_loaded(server, cell):
+    begun, go_on, loaded = threading.Event(), threading.Event(), []
+
+    def load(name):
+        loaded.append(name)
+        begun.set()
+        assert go_on.wait(SEEN_S)
+        return policies.load("exact")
+
+    names = ("exact", *"abcdefgh")
+    page = PlayPage(server, cell, policies.load("exact"), load, names)
+    threads = []
+    for name in names[1:]:
+        page._policy_choice.value = name
+        threads.append(threading.Thread(target=page._choose, args=(SimpleNamespace(client_id=1),)))
+        threads[-1].start()
+        assert begun.wait(SEEN_S)
+    for thread in threads[1:]:
+        thread.join(SEEN_S)
+        assert not thread.is_alive(), "only the thread that loads is busy"
+    go_on.set()
+    threads[0].join(SEEN_S)
+    assert loaded == ["a", "h"]
+    assert page._chosen == "h"
 
 
 @pytest.mark.parametrize("calls", [("stop", "clear"), ("clear",)])

@@ -156,6 +156,11 @@ class InteractiveCell:
         with self._lock:
             self._paused = self._paused and self._stopped
 
+    def toggle(self) -> None:
+        """Pause, or resume if it is paused: as things are now, whatever was shown last."""
+        with self._lock:
+            self._paused = not self._paused or self._stopped
+
     def stop(self) -> None:
         """No arm moves any more when this returns, until :meth:`clear` and then :meth:`resume`."""
         with self._lock:
