@@ -37,7 +37,7 @@ class SimulatedArm:
     """An arm in an :class:`Engine`. ``body`` is its number there, ``hand`` and ``fingers`` are link numbers."""
 
     def __init__(self, engine: Engine, model: ArmModel, base: Base) -> None:
-        self._engine, self._client = engine, engine.client
+        self._engine = engine
         path = urdf_path(str(model.description.path))
         self.body = engine.load_arm(path, base.x_mm, base.y_mm, base.facing_rad)
         count = pybullet.getNumJoints(self.body, physicsClientId=self._client)
@@ -54,6 +54,10 @@ class SimulatedArm:
         engine.coat(self.body, range(-1, count), _SHELL)
         engine.coat(self.body, self.fingers, _PADS)
         self._gear()
+
+    @property
+    def _client(self) -> int:
+        return self._engine.client
 
     def _gear(self) -> None:
         """Couple the fingers, which one servo drives: else a sideways push would shift both, and the pin between them."""

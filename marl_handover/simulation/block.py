@@ -19,7 +19,7 @@ class Block:
     """The block in an :class:`Engine`. Its frame: origin in the middle of its lower face, z along the pin, x through the red bar."""
 
     def __init__(self, engine: Engine, config: BlockConfig) -> None:
-        self._client, self._config = engine.client, config
+        self._engine, self._config = engine, config
         mass, self._centre_mm, moments = _mass_properties(config)
         body, pin = _shapes(config)
         beads = _beads_mm(config)
@@ -77,6 +77,10 @@ class Block:
                 physicsClientId=self._client,
             )
         )
+
+    @property
+    def _client(self) -> int:
+        return self._engine.client
 
     def place(self, pose: Floats) -> None:
         """Stand it on the table at ``pose`` (3,): x_mm, y_mm, theta_rad; at rest."""

@@ -10,15 +10,16 @@ import ctypes
 import math
 import os
 import sys
+import weakref
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Never
 
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.errors import WorkFailed
+from marl_handover.errors import HandoverError, WorkFailed
 
 
 @contextmanager
@@ -85,6 +86,20 @@ class NoWindow(WorkFailed):
         super().__init__("gui = true: PyBullet's window needs a display, and DISPLAY is not set; use gui=false, and video=FILE")
 
 
+class WorldClosed(WorkFailed):
+    """A simulated world is used after it was closed."""
+
+    def __init__(self) -> None:
+        super().__init__("this simulated world was closed; make a new environment")
+
+
+class WorldNotCopied(HandoverError, TypeError):
+    """A simulated world is to be copied or pickled."""
+
+    def __init__(self) -> None:
+        super().__init__("a simulated world cannot be copied or pickled; make another environment, and reset it with the same seed")
+
+
 class Surface(NamedTuple):
     """Friction of a body's surface; Bullet multiplies the lateral values of two that touch.
 
@@ -105,19 +120,41 @@ class Touch(NamedTuple):
 
 
 class Engine:
-    """A physics client. Several live side by side in one process; each call names its own."""
+    """A physics client. Several live side by side in one process; each call names its own.
+
+    It is let go when the engine is closed or nobody holds it any more. It cannot be copied: two engines would share one world.
+
+    Raises:
+        NoWindow: if ``gui`` and there is no display.
+    """
 
     def __init__(self, gui: bool = False) -> None:
         # Without a display PyBullet does not fail, it ends the process.
         if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
             raise NoWindow()
         try:
-            self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
+            client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         except pybullet.error as error:
             raise NoWindow() from error
-        if self.client < 0:
+        if client < 0:
             raise NoWindow()
+        self._client = client
+        self._connection = weakref.finalize(self, _disconnect, client)
         self.time_s = 0.0
+
+    @property
+    def client(self) -> int:
+        """The number by which PyBullet knows this world. It gives the number to another world later.
+
+        Raises:
+            WorldClosed: after :meth:`close`.
+        """
+        if not self._connection.alive:
+            raise WorldClosed()
+        return self._client
+
+    def __reduce__(self) -> Never:
+        raise WorldNotCopied()
 
     def clear(self) -> None:
         """An empty world at time 0, as if just connected: nothing of what went before is left to influence what comes."""
@@ -135,15 +172,14 @@ class Engine:
     def advance(self, seconds: float) -> None:
         """Let time pass, in whole steps."""
         steps = round(seconds / self._step_s)
+        client = self.client
         for _ in range(steps):
-            pybullet.stepSimulation(physicsClientId=self.client)
+            pybullet.stepSimulation(physicsClientId=client)
         self.time_s += steps * self._step_s
 
     def close(self) -> None:
         """Disconnect; a second call does nothing."""
-        if self.client >= 0:
-            pybullet.disconnect(physicsClientId=self.client)
-        self.client = -1
+        self._connection()
 
     def load_arm(self, path: Path, x_mm: float, y_mm: float, yaw_rad: float) -> int:
         """A URDF with its base fixed to the table; gives the body's number."""
@@ -182,6 +218,11 @@ class Engine:
         only = {} if first_link is None else {"linkIndexA": first_link}
         found = pybullet.getContactPoints(bodyA=first, bodyB=second, physicsClientId=self.client, **only) or ()
         return [Touch((hit[1], hit[3]), (hit[2], hit[4]), hit[8] / _UNITS_PER_MM, hit[9] / SCALE) for hit in found]
+
+
+def _disconnect(client: int) -> None:
+    with suppress(pybullet.error):  # whose window was closed by hand
+        pybullet.disconnect(physicsClientId=client)
 
 
 def length(mm: float) -> float:
