@@ -13,6 +13,7 @@ import copy
 import enum
 import math
 import numbers
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from marl_handover.errors import InvalidSetting, NotFinite, UnknownChoice
+from marl_handover.files import expanded
 
 LONGEST_TEXT, LONGEST_LIST = 4096, 1000
 MAX_SEED = 10**9 - 2
@@ -43,6 +45,7 @@ class Bounds:
     items: str = "items"
     longest: int = LONGEST_TEXT
     is_path: bool = False
+    is_name: bool = False
 
     @property
     def numeric(self) -> bool:
@@ -55,6 +58,7 @@ class Bounds:
 
 
 _GENERAL = Bounds()
+_NO_NAME = re.compile(r"[^\w.+-]")
 _NO_LISTS = (0, 0)
 """Of what is inside the inner lists already."""
 _KEY = "bounds"
@@ -95,6 +99,11 @@ def path_field(default: str | None = "") -> Any:
     return _field(default, Bounds(is_path=True))
 
 
+def name_field(default: str = "") -> Any:
+    """A dataclass field for a name that folders and files are called after: a single word, which leads to no other folder."""
+    return _field(default, Bounds(longest=100, is_name=True))
+
+
 def sized(default: Callable[[], Any], low: int, high: int) -> Any:
     """A dataclass field for a list or mapping of ``low`` to ``high`` items, made by ``default``."""
     return _field(default, Bounds(length=(low, high)))
@@ -123,6 +132,18 @@ def check_bounds(settings: Any, prefix: str = "") -> None:
     """
     for item in fields(settings):
         _check(f"{prefix}{item.name}", getattr(settings, item.name), bounds_of(item), item.default is None)
+
+
+def expand_paths(settings: Any) -> None:
+    """Expand a leading ``~`` in every setting of a dataclass instance that is a path, in place."""
+    for item in fields(settings):
+        value = getattr(settings, item.name)
+        if bounds_of(item).is_path and isinstance(value, str) and value.startswith("~"):
+            setattr(settings, item.name, str(expanded(value)))
+        inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else [value]
+        for each in inside:
+            if is_dataclass(each):
+                expand_paths(each)
 
 
 def _check(name: str, value: Any, bounds: Bounds, optional: bool) -> None:
@@ -174,6 +195,8 @@ def _check_text(name: str, value: str, bounds: Bounds) -> None:
         raise UnknownChoice(name, value, bounds.choices)
     if len(value) > bounds.longest:
         raise InvalidSetting(name, value, f"at most {bounds.longest} characters; this has {len(value)}")
+    if bounds.is_name and (_NO_NAME.search(value) or value in (".", "..")):
+        raise InvalidSetting(name, value, "a name of letters, digits and . _ - + only, which folders and files are called after")
     if any(character < " " or character == "\x7f" for character in value):
         raise InvalidSetting(name, value, "text without control characters")
 

@@ -12,9 +12,11 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from marl_handover.errors import BadOverride, HandoverError
+from marl_handover.errors import BadOverride, HandoverError, shortened, shown
 
 PROGRAM = "marl-handover"
+LONGEST_LINE = 300
+"""Characters of the line that refuses bad input, its end included."""
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 1, 2, 130, 141
 
 
@@ -64,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         close = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean {close[0]!r}? " if close else ""
-        return _fail(PROGRAM, f"unknown command {name!r}; {hint}commands: {', '.join(COMMANDS)}", EXIT_BAD_INPUT)
+        return _fail(PROGRAM, f"unknown command {shown(name, 30)}; {hint}commands: {', '.join(COMMANDS)}", EXIT_BAD_INPUT)
     return _guarded(name, arguments[1:])
 
 
@@ -151,8 +153,9 @@ def _version() -> str:
 
 
 def _fail(speaker: str, message: str, status: int) -> int:
-    """Print ``message`` as one line on stderr, and pass ``status`` on."""
-    print(f"{speaker}: {' '.join(message.split())}", file=sys.stderr)
+    """Print ``message`` as one line on stderr, and pass ``status`` on. Bad input is told briefly: whoever sent it may have sent much."""
+    line = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in " ".join(message.split()))
+    print(f"{speaker}: {shortened(line, LONGEST_LINE - len(speaker) - 3) if status == EXIT_BAD_INPUT else line}", file=sys.stderr)
     return status
 
 

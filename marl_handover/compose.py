@@ -21,22 +21,26 @@ from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from marl_handover.bounds import check_bounds
+from marl_handover.bounds import check_bounds, expand_paths
 from marl_handover.compose_help import keys_help
-from marl_handover.compose_schema import Groups, Keys, SchemaTree, fitted, load_mapping, option_file, without_none
+from marl_handover.compose_schema import Groups, Keys, SchemaTree, fitted, option_file, without_none
 from marl_handover.errors import BadOverride, CorruptFile, HandoverError, UnknownChoice
+from marl_handover.parsing import DEPTH, nesting, parse_yaml, read_yaml
 from marl_handover.resources import resource_path
 
 __all__ = ["compose", "from_text", "from_yaml", "keys_help", "to_yaml"]
 
+LONGEST_ARGUMENT = 10_000
+"""Characters of a ``key=value``: Hydra's parser takes its time over long ones, and text is at most 4096."""
+
 _KEY = re.compile(r"[A-Za-z_]\w*(\.[\w-]+)*")
+_MANY_DIGITS = re.compile(r"\d{100,}")
 _DEFAULTS_KEY = re.compile(r"(?:override\s+)?/?([\w.]+)")
 
 
@@ -75,17 +79,15 @@ def from_yaml(schema: type, path: Path | str, groups: Groups | None = None) -> A
     Raises :class:`MissingFile`, or :class:`CorruptFile` when the file is no YAML mapping or does not fit ``schema``.
     """
     path = Path(path)
-    return _fitted_tree(schema, load_mapping(path, "configuration"), path, groups)
+    return _fitted_tree(schema, read_yaml(path, "configuration"), path, groups)
 
 
 def from_text(schema: type, text: str, origin: Path, groups: Groups | None = None) -> Any:
     """As :func:`from_yaml`, of YAML text that was stored in the file ``origin``."""
     try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise CorruptFile("configuration in", origin, _reason(error)) from error
-    if not isinstance(tree, dict):
-        raise CorruptFile("configuration in", origin, "it is no mapping")
+        tree = parse_yaml(text)
+    except ValueError as error:
+        raise CorruptFile("configuration in", origin, str(error)) from error
     return _fitted_tree(schema, tree, origin, groups)
 
 
@@ -136,6 +138,8 @@ class _Composer:
 
     def split(self, text: str) -> _Argument:
         """``text`` at its first ``=``, with a shorthand replaced by the key it stands for."""
+        if len(text) > LONGEST_ARGUMENT:
+            raise BadOverride(text, f"it has {len(text)} characters, more than {LONGEST_ARGUMENT}")
         key, equals, raw = text.partition("=")
         key = key.strip()
         if key.startswith("~"):
@@ -161,7 +165,7 @@ class _Composer:
         preset_name = None if own else next((a.choice for a in reversed(arguments) if a.keys == ("preset",)), None)
         if preset_name:
             file = option_file("preset", preset_name, self.configs / "preset", None)
-            preset = load_mapping(file, "preset")
+            preset = read_yaml(file, "preset")
             self._take_defaults(preset, choices, file)
             self._take_choices(preset, (), choices, file)
         values = []
@@ -190,6 +194,7 @@ class _Composer:
             raise BadOverride(f"{error.full_key}=…", "this setting has no default and must be given") from error
         except OmegaConfBaseException as error:
             raise BadOverride(error.full_key or "configuration", _reason(error)) from error
+        expand_paths(config)
         check_bounds(config)
         return config
 
@@ -239,7 +244,7 @@ class _Composer:
         if not self._is_section(keys):
             raise BadOverride(f"{dotted}={choice.name}", f"{dotted} is a single value, not a section with options")
         file = option_file(dotted, choice.name, self.configs / keys[-1], choice.file)
-        tree = load_mapping(file, keys[-1])
+        tree = read_yaml(file, keys[-1])
         if "name" in self.tree.names(keys):
             tree.setdefault("name", file.stem)  # so that a user's cell does not pass for the shipped one
         self.assign_tree(keys, tree, file)
@@ -251,6 +256,10 @@ class _Composer:
         quoted = raw[:1] in ("'", '"')
         if bare in (str, Path) and not quoted:
             return None if raw == "null" and bare != kind else raw
+        if nesting(raw) > DEPTH:
+            raise BadOverride(argument.text, f"its brackets nest deeper than {DEPTH} levels")
+        if digits := _MANY_DIGITS.search(raw):
+            raise BadOverride(argument.text, f"it holds a number of {len(digits[0])} digits")
         try:
             override: Override = OverridesParser.create().parse_override(f"{argument.keys[0]}={raw}")
         except HydraException as error:
@@ -277,7 +286,7 @@ class _Composer:
                 raise BadOverride(text + where, f"{'.'.join(keys)} is a section; set one of: {', '.join(self.tree.names(keys))}")
         try:
             self.tree.merge(keys, fitted(bare, value))
-        except (OmegaConfBaseException, ValueError, TypeError) as error:
+        except (OmegaConfBaseException, ValueError, TypeError, OverflowError) as error:
             raise BadOverride(text + where, _reason(error)) from error
         return None
 

@@ -8,13 +8,12 @@ import types
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
-import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from marl_handover.errors import BadOverride, CorruptFile, HandoverError, MissingFile, UnknownChoice, UnknownKey
+from marl_handover.errors import BadOverride, HandoverError, MissingFile, UnknownChoice, UnknownKey
+from marl_handover.files import expanded
 
 Groups = Mapping[str, Mapping[str, type]]
 """Dotted key -> option name -> dataclass."""
@@ -150,7 +149,7 @@ def option_file(key: str, value: str, folder: Path, named_in: Path | None) -> Pa
     Raises :class:`MissingFile`, :class:`UnknownChoice`, or :class:`BadOverride` if ``key`` has no named options at all.
     """
     if "/" in value or value.endswith((".yaml", ".yml")):
-        path = Path(value).expanduser()
+        path = expanded(value)
         path = named_in.parent / path if named_in is not None else path
         if not path.is_file():
             raise MissingFile(f"{key} file", path, "check the path, or use a name" + _listing(folder))
@@ -163,23 +162,6 @@ def option_file(key: str, value: str, folder: Path, named_in: Path | None) -> Pa
             f"{key}={value}", f"{key} is a section: set its keys one by one ({key}.key=value) or give a YAML file (./file.yaml)"
         )
     raise UnknownChoice(key, value, [*closest_first(value, names), "a path such as ./my.yaml"])
-
-
-def load_mapping(path: Path, what: str) -> dict[str, Any]:
-    """A YAML mapping as plain data, references left unresolved; an empty file is an empty mapping.
-
-    Raises :class:`MissingFile` or :class:`CorruptFile`.
-    """
-    if not path.is_file():
-        raise MissingFile(what, path)
-    try:
-        text = path.read_text(encoding="utf-8")
-        if not isinstance(yaml.compose(text, Loader=yaml.SafeLoader), (yaml.MappingNode, type(None))):
-            raise CorruptFile(what, path, "expected key: value lines")
-        tree = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
-    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
-        raise CorruptFile(what, path, " ".join(str(error).split()) or type(error).__name__) from error
-    return cast(dict[str, Any], tree)  # keys that are no text fail later, as unknown keys
 
 
 def _listing(folder: Path) -> str:

@@ -11,6 +11,35 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+LONGEST_VALUE, LONGEST_LIST, LONGEST_REASON = 60, 160, 220
+"""Characters of a value, of a list of choices and of a reason in a message."""
+
+
+def shortened(text: str, longest: int = LONGEST_VALUE) -> str:
+    """``text``, its middle left out if it is longer than ``longest``: both ends tell most."""
+    if len(text) <= longest:
+        return text
+    head = (longest - 5) * 2 // 3
+    return f"{text[:head]} ... {text[len(text) - (longest - 5 - head) :]}"
+
+
+def shown(value: Any, longest: int = LONGEST_VALUE) -> str:
+    """A value as messages show it: its short ``repr``."""
+    try:
+        return shortened(repr(value), longest)
+    except ValueError:  # the interpreter writes out no number of more than 4300 digits
+        return "a number of thousands of digits"
+
+
+def listed(choices: Iterable[Any], longest: int = LONGEST_LIST) -> str:
+    """Choices, separated by commas, as many as there is room for; the first ones matter most."""
+    names, length = [str(choice) for choice in choices], 0
+    for index, name in enumerate(names):
+        length += len(name) + 2
+        if length > longest and index:
+            return f"{', '.join(names[:index])} and {len(names) - index} more"
+    return ", ".join(names)
+
 
 class HandoverError(Exception):
     """Base of all errors of this package. Attribute ``exit_status``: 2 for bad input, 1 for work that failed."""
@@ -28,7 +57,7 @@ class InvalidSetting(HandoverError):
     """A setting has a value outside its limits."""
 
     def __init__(self, name: str, value: Any, limit: str) -> None:
-        super().__init__(f"{name} = {value!r}: must be {limit}")
+        super().__init__(f"{shortened(name, LONGEST_LIST)} = {shown(value)}: must be {limit}")
         self.name, self.value, self.limit = name, value, limit
 
 
@@ -37,7 +66,7 @@ class UnknownChoice(HandoverError):
 
     def __init__(self, name: str, value: Any, choices: Iterable[str]) -> None:
         self.name, self.value, self.choices = name, value, tuple(choices)
-        super().__init__(f"{name} = {value!r} is not known; choose one of: {', '.join(self.choices)}")
+        super().__init__(f"{shortened(name)} = {shown(value)} is not known; choose one of: {listed(self.choices)}")
 
 
 class UnknownKey(HandoverError):
@@ -45,14 +74,14 @@ class UnknownKey(HandoverError):
 
     def __init__(self, key: str, choices: Iterable[str]) -> None:
         self.key, self.choices = key, tuple(choices)
-        super().__init__(f"unknown key {key!r}; valid keys: {', '.join(self.choices)}")
+        super().__init__(f"unknown key {shown(key, LONGEST_LIST)}; valid keys: {listed(self.choices)}")
 
 
 class BadOverride(HandoverError):
     """A ``key=value`` argument that cannot be read."""
 
     def __init__(self, text: str, reason: str) -> None:
-        super().__init__(f"cannot read {text!r}: {reason}")
+        super().__init__(f"cannot read {shown(text)}: {shortened(reason, LONGEST_REASON)}")
         self.text, self.reason = text, reason
 
 
@@ -60,7 +89,7 @@ class MissingFile(HandoverError):
     """A file or folder that was named is not there."""
 
     def __init__(self, what: str, path: Path | str, fix: str = "check the path") -> None:
-        super().__init__(f"{what} not found: {path}; {fix}")
+        super().__init__(f"{what} not found: {shortened(str(path), LONGEST_LIST)}; {fix}")
         self.what, self.path, self.fix = what, Path(path), fix
 
 
@@ -68,7 +97,7 @@ class CorruptFile(HandoverError):
     """A file is there but cannot be read as what it should be."""
 
     def __init__(self, what: str, path: Path | str, reason: str) -> None:
-        super().__init__(f"{what} {path} cannot be read: {reason}")
+        super().__init__(f"{what} {shortened(str(path), LONGEST_LIST)} cannot be read: {shortened(reason, LONGEST_REASON)}")
         self.what, self.path, self.reason = what, Path(path), reason
 
 
@@ -128,7 +157,7 @@ class NotFinite(InvalidSetting):
     """A number that must be finite is NaN or infinite."""
 
     def __init__(self, what: str, value: Any) -> None:
-        HandoverError.__init__(self, f"{what} = {value}: every number must be finite")
+        HandoverError.__init__(self, f"{what} = {shortened(str(value))}: every number must be finite")
         self.what = self.name = what
         self.value, self.limit = value, "finite"
 

@@ -23,7 +23,7 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.errors import CannotWrite, CorruptFile, MissingFile
+from marl_handover.errors import CannotWrite, CorruptFile, InvalidSetting, MissingFile
 
 LOG = logging.getLogger(__name__)
 Parsed = TypeVar("Parsed")
@@ -38,6 +38,37 @@ KINDS = {
 }
 
 _TEMPORARY = re.compile(r"\.\d+-[0-9a-f]{8}\.tmp(\.\w+)?$")
+
+
+def expanded(text: str | Path) -> Path:
+    """A path that a user gave, a leading ``~`` or ``~name`` replaced by that home folder.
+
+    Raises:
+        InvalidSetting: no such home is known.
+    """
+    try:
+        return Path(text).expanduser()
+    except RuntimeError as error:
+        raise InvalidSetting("path", str(text), "written out: no such home folder is known") from error
+
+
+def cache_folder() -> Path:
+    """Where this user's caches are kept: ``$XDG_CACHE_HOME/marl_handover``, ``~/.cache/marl_handover``, or among temporary files.
+
+    The last is for accounts without a home folder; it is theirs alone, and where it is not, a new one is made for this process.
+    """
+    chosen = os.environ.get("XDG_CACHE_HOME")
+    if not chosen:
+        with suppress(RuntimeError):
+            chosen = str(Path.home() / ".cache")
+    if chosen:
+        return Path(chosen, "marl_handover")
+    folder = Path(tempfile.gettempdir(), f"marl_handover-{os.geteuid()}")
+    with suppress(OSError):
+        folder.mkdir(mode=0o700, exist_ok=True)
+    about = os.lstat(folder)
+    own = stat.S_ISDIR(about.st_mode) and about.st_uid == os.geteuid() and not about.st_mode & 0o022
+    return folder if own else Path(tempfile.mkdtemp(prefix="marl_handover-"))
 
 
 @contextmanager

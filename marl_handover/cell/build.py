@@ -11,6 +11,7 @@ from marl_handover.cell.spaces import AnnulusFit, ManipulationGrid, fit_annulus,
 from marl_handover.compose import from_yaml, to_yaml
 from marl_handover.config import CellConfig, check_bounds, require_choice
 from marl_handover.errors import MissingFile
+from marl_handover.files import expanded
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.urdf import read_urdf
 from marl_handover.resources import resource_path
@@ -27,7 +28,7 @@ class CellModel(NamedTuple):
 
 def urdf_path(urdf: str) -> Path:
     """A URDF by path, or by the name of a shipped one."""
-    path = Path(urdf)
+    path = expanded(urdf)
     if path.exists() or path.parent != Path():
         return path
     try:
@@ -58,7 +59,7 @@ def cell_config(name: str) -> CellConfig:
     Raises:
         UnknownChoice, MissingFile, CorruptFile: if there is none.
     """
-    path = Path(name)
+    path = expanded(name)
     if path.suffix not in (".yaml", ".yml"):
         folder = resource_path("configs/cell")
         require_choice("cell", name, tuple(sorted(file.stem for file in folder.glob("*.yaml"))))

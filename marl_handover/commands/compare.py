@@ -58,7 +58,7 @@ def run(config: CompareConfig) -> int:
     if config.seeds:
         suite = suite.with_seeds(config.seeds)
     _check(config, suite)
-    out = Path(config.out or f"runs/compare/{suite.name}{'' if suite.size == 'full' else '-' + suite.size}").expanduser().absolute()
+    out = Path(config.out or f"runs/compare/{suite.name}{'' if suite.size == 'full' else '-' + suite.size}").absolute()
     if out.exists() and not out.is_dir():
         raise InvalidSetting("out", str(out), "a folder; this is a file")
     tasks = plan_tasks(suite, out, Grammar(train.ALIASES, train.GROUPS), Grammar(evaluate.ALIASES, evaluate.GROUPS))

@@ -10,6 +10,7 @@ from typing import Any
 
 from marl_handover.config import SYMMETRY_ORDER, CellConfig, MotionConfig, bounded, check_bounds, chosen, path_field
 from marl_handover.errors import CorruptFile, InvalidSetting, UnknownChoice
+from marl_handover.files import expanded
 
 Figure = Any
 """matplotlib's, which only :mod:`marl_handover.report` imports."""
@@ -78,7 +79,7 @@ def run_folders(text: str) -> list[Path]:
 def _paths(text: str) -> list[Path]:
     inner = text[1:-1] if text.startswith("[") and text.endswith("]") else None
     names = [text] if inner is None else inner.split(",")
-    return [Path(name.strip().strip("'\"")) for name in names if name.strip()]
+    return [expanded(name.strip().strip("'\"")) for name in names if name.strip()]
 
 
 def _run(config: PlotConfig) -> tuple[Figure, Path]:
@@ -223,8 +224,8 @@ def _whole_suite(config: PlotConfig) -> int:
 
 def _suite(config: PlotConfig) -> tuple[Path, dict[str, Figure | None]]:
     """Folder and figures of a suite, from its stored numbers alone."""
+    from marl_handover.parsing import read_json
     from marl_handover.report.compare import make_figures
-    from marl_handover.report.files import read_json
 
     if not config.suite:
         raise InvalidSetting("suite", config.suite, "a folder that `marl-handover compare` wrote, such as runs/compare/paper")
@@ -238,7 +239,7 @@ def _suite(config: PlotConfig) -> tuple[Path, dict[str, Figure | None]]:
 
 
 def _json(config: PlotConfig) -> tuple[Path, dict[str, Any]]:
-    from marl_handover.report.files import read_json
+    from marl_handover.parsing import read_json
 
     if not config.json:
         raise InvalidSetting("json", config.json, f"the file that `marl-handover {WROTE[config.kind]}` wrote")

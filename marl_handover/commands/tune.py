@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from marl_handover.commands import train
-from marl_handover.config import bounded, check_bounds, chosen, path_field
+from marl_handover.config import bounded, check_bounds, chosen, name_field, path_field
 from marl_handover.errors import InvalidSetting
 from marl_handover.files import write_whole
 from marl_handover.learning.settings import TrainConfig
@@ -34,7 +34,7 @@ class TuneConfig(TrainConfig):
     search: str = path_field()  # ranges to search in: a name or a YAML file; the algorithm's own if empty
     fixed: list[str] = field(default_factory=list)  # keys of the search space that are left as they are
     trials: int = bounded(20, 1, 100_000)  # that the study has in the end; a call does those that are left
-    study: str = ""  # its name in the storage; the algorithm's if empty
+    study: str = name_field()  # its name in the storage; the algorithm's if empty
     storage: str = ""  # postgresql://user:password@host/name, sqlite:///file or a journal file's path; <out>/study.journal if empty
     pruner: str = chosen("median", ("median", "hyperband", "none"))  # what ends hopeless trials: median, hyperband or none
     launcher: str = chosen("loky", ("loky", "ray"))  # loky: the cores of this machine; ray: a cluster

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from marl_handover.compare.tables import make_tables, markdown
 from marl_handover.errors import HandoverError
-from marl_handover.report.files import read_json
+from marl_handover.parsing import read_json
 
 NOT_RUN = "Not run yet."
 RESULTS = "results.json"

@@ -15,6 +15,7 @@ from marl_handover.compare.suite_check import RUN
 from marl_handover.compose import compose
 from marl_handover.compose_schema import Groups
 from marl_handover.errors import HandoverError, InvalidSetting, UnknownChoice
+from marl_handover.files import expanded
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.policies.registry import NAMES
 from marl_handover.policies.shielded import SHIELDED
@@ -102,7 +103,7 @@ def _placed(policy: str) -> str:
         return SHIELDED + _placed(policy.removeprefix(SHIELDED))
     if policy in NAMES:
         return policy
-    path = Path(policy).expanduser()
+    path = expanded(policy)
     if path.parent == Path() and path.suffix != ".npz" and not path.exists():
         raise UnknownChoice("policy", policy, (*NAMES, f"{SHIELDED}NAME", "a run directory", "a policy file (.npz)"))
     return str(path.absolute())

@@ -16,6 +16,7 @@ from typing import Any
 from marl_handover.errors import HandoverError
 from marl_handover.files import write_whole
 from marl_handover.learning.settings import TrainConfig
+from marl_handover.parsing import parse_json, read_json
 from marl_handover.policies.registry import content_hash
 from marl_handover.resources import package_path
 from marl_handover.runtime.assessment import AssessmentConfig
@@ -45,7 +46,7 @@ DONE_KEYS: Needed = {"row": str, "seed": int, "evaluations": dict}
 
 def settings_of(config: TrainConfig | AssessmentConfig) -> Settings:
     """All settings by dotted key, as JSON has them, without those that only say where things are."""
-    flat = _flat(json.loads(json.dumps(asdict(config))))
+    flat = _flat(parse_json(json.dumps(asdict(config))))
     return {key: value for key, value in flat.items() if key not in PLACES}
 
 
@@ -110,10 +111,8 @@ def read_record(path: Path, needed: Needed | None = None) -> dict[str, Any] | No
     Records are written as a whole, so that a damaged one is as good as none: what it told is made again.
     """
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    if not isinstance(record, dict):
+        record = read_json(path, "record", finite=False)
+    except HandoverError:
         return None
     return record if all(isinstance(_value(record, key), kind) for key, kind in (needed or {}).items()) else None
 

@@ -20,6 +20,7 @@ from typing import Any
 from marl_handover.compare import records, suite_check
 from marl_handover.compare.records import fingerprint, read_record, settings_of, write_record
 from marl_handover.errors import HandoverError, WorkFailed
+from marl_handover.files import expanded
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.locks import held
 from marl_handover.runtime.assessment import AssessmentConfig
@@ -44,9 +45,9 @@ class Judgement:
 
     def placed(self) -> AssessmentConfig:
         """The settings with absolute paths: a worker may stand in another folder."""
-        problems = self.config.problems and str(self.base / Path(self.config.problems).expanduser())
+        problems = self.config.problems and str(self.base / expanded(self.config.problems))
         folder = self.config.calibration or (str(twin_lab().folder()) if self.config.backend == "twin" else None)
-        return replace(self.config, problems=problems, calibration=folder and str(self.base / Path(folder).expanduser()))
+        return replace(self.config, problems=problems, calibration=folder and str(self.base / expanded(folder)))
 
     def contents(self) -> dict[str, str]:
         """Hashes of the files that it reads, see :func:`marl_handover.compare.records.contents_of`."""

@@ -15,9 +15,10 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from marl_handover.compare.suite_check import MAX_SEEDS, RUN, check
-from marl_handover.compose_schema import load_mapping, option_file
+from marl_handover.compose_schema import option_file
 from marl_handover.config import bounded, require_between, require_choice
 from marl_handover.errors import CorruptFile, HandoverError, UnknownChoice
+from marl_handover.parsing import read_yaml
 from marl_handover.resources import resource_path
 
 EVALUATION_SEED_OFFSET = 100
@@ -171,7 +172,7 @@ def load_suite(name: str) -> Suite:
         CorruptFile: it is no suite; names the entry.
     """
     path = option_file("suite", name, suite_folder(), None)
-    tree = load_mapping(path, "suite")
+    tree = read_yaml(path, "suite")
     lists = {"rows": RowSpec, "evaluations": EvaluationSpec, "figures": FigureSpec, "tables": TableSpec}
     parts: dict[str, Any] = {}
     for key, schema in lists.items():

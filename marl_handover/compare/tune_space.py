@@ -19,10 +19,10 @@ import yaml
 from optuna import Trial
 
 from marl_handover.compose import from_text, to_yaml
-from marl_handover.compose_schema import load_mapping
 from marl_handover.errors import CorruptFile, HandoverError, UnknownKey
 from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.settings import TrainConfig
+from marl_handover.parsing import parse_yaml, read_yaml
 
 KINDS = ("float", "int", "categorical")
 
@@ -80,7 +80,7 @@ def load_space(path: Path, config: TrainConfig, fixed: Collection[str] = ()) -> 
         MissingFile, CorruptFile: no such file, no such description, a setting that does not exist or cannot have such a value.
         UnknownKey: ``fixed`` names a key that the file does not have.
     """
-    tree = load_mapping(path, "search space")
+    tree = read_yaml(path, "search space")
     space = tuple(_parameter(str(key), about, path) for key, about in tree.items())
     for key in fixed:
         if key not in tree:
@@ -138,7 +138,7 @@ def applied(config: TrainConfig, values: Mapping[str, Any], origin: Path) -> Tra
 
     Raises :class:`CorruptFile` for a key that does not exist or a value of another type.
     """
-    tree = yaml.safe_load(to_yaml(config))
+    tree = parse_yaml(to_yaml(config))
     for key, value in values.items():
         *sections, name = key.split(".")
         section = tree

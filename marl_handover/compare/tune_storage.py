@@ -21,6 +21,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
 from marl_handover.errors import HandoverError
+from marl_handover.files import expanded
 from marl_handover.locks import held
 
 BEAT_S = 60.0
@@ -60,12 +61,12 @@ def located(storage: str, folder: Path) -> str:
         name, mark, options = rest.removeprefix("/").partition("?")
         if not name or ":memory:" in rest or "mode=memory" in options:
             raise StorageUnavailable(storage, "is a database in memory, which no other process sees; sqlite:///file keeps the study")
-        return storage if name.startswith("file:") else f"{scheme}:///{Path(name).absolute()}{mark}{options}"
+        return storage if name.startswith("file:") else f"{scheme}:///{expanded(name).absolute()}{mark}{options}"
     if slashes:
         return storage
     if re.match(r"\w+:", storage):
         raise StorageUnavailable(storage, "is neither a URL, such as postgresql://user:password@host/name, nor the path of a journal file")
-    return str(Path(storage or folder / "study.journal").absolute())
+    return str(expanded(storage or folder / "study.journal").absolute())
 
 
 def open_storage(storage: str) -> BaseStorage:

@@ -23,6 +23,7 @@ from marl_handover.files import keep, write_whole
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.settings import ARMS, HardwareConfig
+from marl_handover.parsing import read_json
 
 Floats = NDArray[np.float64]
 
@@ -175,7 +176,7 @@ def load_calibration(path: Path | str, arm: str, model: ArmModel) -> ArmCalibrat
     if not path.is_file():
         raise MissingFile("servo calibration", path, "run: marl-handover calibrate")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, "servo calibration")
         version = content["version"]
         if version != VERSION:
             raise CorruptFile("servo calibration", path, f"it has version {version!r}, this program reads {VERSION}")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from marl_handover.files import temporary_of
 from marl_handover.hardware.roll import Roll
+from marl_handover.parsing import parse_object
 
 
 class StopLatch:
@@ -65,7 +66,7 @@ class StopLatch:
         if self._here or not self.is_set():
             return self._here
         try:
-            return str(json.loads(self.path.read_text(encoding="utf-8"))["reason"])
+            return str(parse_object(self.path.read_text(encoding="utf-8"))["reason"])
         except (OSError, ValueError, KeyError, TypeError):
             return "stop file present"
 

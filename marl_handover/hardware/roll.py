@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from marl_handover.errors import WorkFailed
 from marl_handover.files import write_whole
+from marl_handover.parsing import parse_object
 
 _COUNT = itertools.count()
 
@@ -103,7 +104,7 @@ def _receipt(entry: Path) -> Path:
 def _read(entry: Path) -> Signed | None:
     """None: it was taken off meanwhile, or is no entry."""
     try:
-        about = json.loads(entry.read_text(encoding="utf-8"))
+        about = parse_object(entry.read_text(encoding="utf-8"))
         return Signed(int(about["pid"]), Path(about["stop_file"]), _receipt(entry).exists(), entry)
     except (OSError, ValueError, KeyError, TypeError):
         return None

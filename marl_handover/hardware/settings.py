@@ -11,7 +11,7 @@ import os
 import re
 from dataclasses import dataclass, field
 
-from marl_handover.config import require_at_least, require_between, require_choice, require_positive
+from marl_handover.config import name_field, require_at_least, require_between, require_choice, require_positive
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.protocol import BAUDS, CHANNELS, PULSE_US
@@ -135,7 +135,7 @@ class EmulatorConfig:
 class HardwareConfig:
     """The electronics of a cell. One board for both arms is the default; for two, name a second one in ``boards`` and in an arm."""
 
-    name: str = "lynxmotion"
+    name: str = name_field("lynxmotion")  # its calibration is kept in a folder of this name
     boards: dict[str, BoardConfig] = field(default_factory=lambda: {"main": BoardConfig()})
     arms: dict[str, ArmWiring] = field(
         default_factory=lambda: {"left": ArmWiring(), "right": ArmWiring(channels=[16, 17, 18, 19, 21], gripper=GripperConfig(channel=20))}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable
@@ -15,8 +14,10 @@ import torch
 from numpy.typing import NDArray
 
 from marl_handover.arrays import wrap
-from marl_handover.errors import CorruptFile, MissingFile, NotFinite, OutOfReach
+from marl_handover.errors import CorruptFile, NotFinite, OutOfReach
+from marl_handover.files import read_bounded
 from marl_handover.learning.rollout import Act, Episodes, Noise, Observer, play
+from marl_handover.parsing import LINES_BYTES, parse_object
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules, carried
@@ -43,18 +44,16 @@ def read_problems(rules: Rules, path: Path) -> tuple[Floats, Floats]:
     Raises:
         MissingFile, CorruptFile, NotFinite, OutOfReach: with the line's number.
     """
-    if not path.is_file():
-        raise MissingFile("problems file", path)
     poses: dict[str, list[Floats]] = {"state": [], "goal": []}
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_bounded(path, LINES_BYTES, "problems file").decode("utf-8")
+    except UnicodeDecodeError as error:
         raise CorruptFile("problems file", path, str(error)) from error
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip():
             continue
         try:
-            row = json.loads(line)
+            row = parse_object(line, finite=False)
             values = {key: np.array(row[key], float).reshape(3) for key in poses}
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise CorruptFile("problems file", path, f"line {number} is not {{'state': [3 numbers], 'goal': [3 numbers]}}") from error

@@ -26,6 +26,7 @@ from marl_handover.learning.recorder import Recorder, require_sound
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.variants import make_variant
 from marl_handover.locks import claimed
+from marl_handover.parsing import parse_yaml
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome
@@ -292,9 +293,7 @@ class Trainer:
 
 
 def _architecture(config_yaml: str) -> str:
-    import yaml
-
-    return str(yaml.safe_load(config_yaml)["task"]["architecture"])
+    return str(parse_yaml(config_yaml)["task"]["architecture"])
 
 
 def usable_device(name: str) -> torch.device:

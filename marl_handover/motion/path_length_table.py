@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -32,7 +31,7 @@ from marl_handover.cell.cell import REACH_TOLERANCE_MM
 from marl_handover.compose import to_yaml
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.errors import CannotWrite, CorruptFile, HandoverError, MissingFile
-from marl_handover.files import writing
+from marl_handover.files import cache_folder, writing
 from marl_handover.resources import package_path
 from marl_handover.task.rules import MotionCost, straight_line_mm
 
@@ -260,6 +259,5 @@ def _kept(cell: Cell, motion: MotionConfig, key: str) -> PathLengthTable:
 
 
 def cache_file(key: str) -> Path:
-    """Where a table of these settings is kept: ``$XDG_CACHE_HOME/marl_handover`` or ``~/.cache/marl_handover``."""
-    folder = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(folder) / "marl_handover" / f"motion_cost_{key}.npz"
+    """Where a table of these settings is kept, see :func:`marl_handover.files.cache_folder`."""
+    return cache_folder() / f"motion_cost_{key}.npz"

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.errors import CorruptFile, HandoverError, MissingFile, WorkFailed
 from marl_handover.files import write_whole
+from marl_handover.parsing import read_json
 from marl_handover.perception.settings import MountConfig
 
 Floats = NDArray[np.float64]
@@ -147,8 +148,8 @@ class CameraCalibration:
         if not path.is_file():
             raise MissingFile("camera calibration", path, "run: marl-handover calibrate camera")
         try:
-            content = json.loads(path.read_text())
-            if not isinstance(content, dict) or content.get("format") != FORMAT:
+            content = read_json(path, "camera calibration")
+            if content.get("format") != FORMAT:
                 raise CorruptFile("camera calibration", path, "it is no calibration of a camera")
             if content.get("version") != VERSION:
                 raise CorruptFile("camera calibration", path, f"it has version {content.get('version')}, this package reads {VERSION}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from marl_handover.config import CellConfig, NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.errors import CorruptFile
 from marl_handover.files import read_arrays
+from marl_handover.parsing import parse_object
 from marl_handover.task.observations import observation_size
 
 KINDS = {
@@ -62,7 +62,7 @@ def require_policy(arrays: Mapping[str, NDArray[Any]], path: Path, what: str) ->
         CorruptFile: it is none. ``path`` and ``what`` are for the message.
     """
     try:
-        about = json.loads(str(arrays["about"]))
+        about = parse_object(str(arrays["about"]))
         _require_known(about)
         for network in range(about.get("networks", 1)):
             _check_chain(network_layers(arrays, about, network))

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import CellConfig, CentralisedConfig, MotionConfig, TaskConfig
 from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, MissingFile, UnknownChoice, first_line
+from marl_handover.files import expanded
 from marl_handover.motion.path_length_table import motion_cost
+from marl_handover.parsing import parse_object
 from marl_handover.policies.baselines import ExactPolicy, GreedyPolicy, RandomPolicy
 from marl_handover.policies.files import KINDS, read_policy, require_policy, stored_settings
 from marl_handover.policies.policy import SupervisorPolicy
@@ -64,7 +66,7 @@ def load(
 
 
 def _made(name: str, arrays: Arrays, cell: Cell | None, task: TaskConfig | None, motion: MotionConfig | None) -> SupervisorPolicy:
-    about = json.loads(str(arrays["about"]))
+    about = parse_object(str(arrays["about"]))
     own_cell, own_task = stored_settings(about)
     rules = _rules(cell or load_cell(own_cell), task or own_task, motion, about)
     module, _, kind = KINDS[about["kind"]].partition(":")
@@ -121,7 +123,7 @@ def content_hash(name: str) -> str:
         return ""
     digest = hashlib.sha256()
     arrays = dict(_arrays(name))
-    about = json.loads(str(arrays.pop("about")))
+    about = parse_object(str(arrays.pop("about")))
     digest.update(json.dumps({**about, "origin": ""}, sort_keys=True).encode())
     for key, array in sorted(arrays.items()):
         digest.update(f"{key} {array.dtype} {array.shape}".encode())
@@ -141,7 +143,7 @@ def _rules(cell: Cell, task: TaskConfig, motion: MotionConfig | None, about: Map
 def _arrays(name: str) -> Arrays:
     if name in NAMES:
         return read_policy(package_path(f"pretrained/{name.removeprefix('pretrained_')}.npz"))
-    path = Path(name)
+    path = expanded(name)
     if path.is_dir():
         from marl_handover.learning.export import run_arrays
 

@@ -12,7 +12,7 @@ import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
+from marl_handover.errors import InvalidSetting
 from marl_handover.files import temporary_of, write_whole
 
 PICTURES = (".png", ".pdf", ".svg")
@@ -43,19 +43,6 @@ def write_json(path: Path, content: dict[str, Any], name: str) -> None:
     """Write a JSON file as a whole. ``name`` is the setting that named it."""
     with _writable(path, name):
         write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
-
-
-def read_json(path: Path, what: str) -> dict[str, Any]:
-    """The JSON object in a file. Raises :class:`MissingFile` or :class:`CorruptFile`."""
-    if not path.is_file():
-        raise MissingFile(what, path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CorruptFile(what, path, str(error)) from error
-    if not isinstance(content, dict):
-        raise CorruptFile(what, path, "it holds no JSON object")
-    return content
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import LoopConfig
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
+from marl_handover.parsing import parse_object
 from marl_handover.runtime.reach import drawn_in
 from marl_handover.task.rules import ROUNDING_RAD, Command, Outcome, Rules
 
@@ -98,11 +98,11 @@ def _steps(path: Path) -> Iterator[dict[str, Any]]:
     """Every step of a first attempt."""
     for number, line in enumerate(path.read_bytes().splitlines(), start=1):
         try:
-            row = json.loads(line)
+            row = parse_object(line)
             if int(row.get("attempt", 0)) > 0:
                 continue
             step = _step(row)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             raise CorruptFile("trace", path, f"line {number} is no step of an episode") from error
         yield step
 

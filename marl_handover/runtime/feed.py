@@ -15,6 +15,7 @@ from marl_handover.errors import CorruptFile, InvalidSetting, WorkFailed
 from marl_handover.files import write_whole
 from marl_handover.hardware.latch import StopLatch
 from marl_handover.hardware.settings import HardwareConfig
+from marl_handover.parsing import parse_json
 from marl_handover.perception.calibration import Pixels
 from marl_handover.perception.overlay import read_picture
 from marl_handover.runtime.steering import Ask, control_name
@@ -71,7 +72,7 @@ class Feed:
             self._state = _checked(_loaded((self.folder / STATE_FILE).read_bytes()), self.folder / STATE_FILE)
         except FileNotFoundError:
             trouble = f"{self.folder} holds no session yet" if self._state is None else f"{self.folder} was emptied or taken away"
-        except (OSError, ValueError, RecursionError, CorruptFile) as error:
+        except (OSError, ValueError, CorruptFile) as error:
             trouble = str(error) if isinstance(error, CorruptFile) else f"the state file cannot be read: {error}"
         state = self._state
         if state is None:
@@ -190,20 +191,8 @@ def _checked(content: Any, path: Path) -> dict[str, Any]:
 
 
 def _loaded(content: bytes) -> Any:
-    """JSON without numbers that nobody can reckon with. Raises ValueError and RecursionError."""
-    return json.loads(content, parse_float=_number, parse_constant=_number, parse_int=_integer)
-
-
-def _number(text: str) -> float:
-    value = float(text)
-    if not abs(value) < _LARGEST:
-        raise ValueError(f"{text[:20]} is not a number of a session")
-    return value
-
-
-def _integer(text: str) -> int:
-    _number(text)
-    return int(text)
+    """JSON without numbers that nobody can reckon with. Raises ValueError."""
+    return parse_json(content, largest=_LARGEST)
 
 
 def _here(state: dict[str, Any]) -> bool:
@@ -227,6 +216,6 @@ def _gone(state: dict[str, Any]) -> bool:
 def _row(line: bytes) -> dict[str, Any]:
     try:
         row = _loaded(line)
-    except (ValueError, RecursionError):
+    except ValueError:
         row = None
     return row if isinstance(row, dict) and "event" in row else {"t_s": None, "event": "a damaged line"}

@@ -15,6 +15,7 @@ from marl_handover.files import keep, write_whole
 from marl_handover.hardware.calibration import CalibrationProblem
 from marl_handover.hardware.protocol import PULSE_US
 from marl_handover.hardware.settings import ARMS, GripperConfig, HardwareConfig
+from marl_handover.parsing import read_json
 
 FILE = "grippers.json"
 VERSION = 1
@@ -64,7 +65,7 @@ def with_grippers(hardware: HardwareConfig, folder: Path) -> HardwareConfig:
     if not path.is_file():
         return hardware
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, "gripper calibration")
         if content["version"] != VERSION:
             raise CorruptFile("gripper calibration", path, f"it has version {content['version']!r}, this program reads {VERSION}; {_AGAIN}")
         asked = {arm: {name: float(content["arms"][arm]["settings"][name]) for name in _ASKED} for arm in ARMS}

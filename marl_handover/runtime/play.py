@@ -22,6 +22,7 @@ from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration
 from marl_handover.hardware.settings import ARMS
 from marl_handover.motion.trajectory import Phase
+from marl_handover.parsing import read_json
 
 Floats = NDArray[np.float64]
 
@@ -95,7 +96,7 @@ def load_play(folder: Path) -> dict[str, Floats]:
     if not path.is_file():
         raise MissingFile("play of the servos", path, AGAIN)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, "play of the servos")
         if content["version"] != VERSION:
             why = f"it has version {content['version']!r}, this program reads {VERSION}, a band for each joint"
             raise CorruptFile("play of the servos", path, f"{why}; {AGAIN}")

@@ -13,6 +13,7 @@ from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
 from marl_handover.files import keep, write_whole
 from marl_handover.hardware.calibration import ArmCalibration, CalibrationProblem
 from marl_handover.hardware.settings import ARMS
+from marl_handover.parsing import read_json
 from marl_handover.runtime.play import AGAIN, save_play
 from marl_handover.runtime.play import FILE as PLAY_FILE
 
@@ -68,7 +69,7 @@ def require_one_set(folder: Path, names: Collection[str] = NAMES) -> None:
             raise MissingFile("servo calibration", folder / name, AGAIN)
     path = folder / SET_FILE
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, "servo calibration")
         if content["version"] != VERSION:
             raise CorruptFile("servo calibration", path, f"it has version {content['version']!r}, this program reads {VERSION}; {AGAIN}")
         wanted = {name: str(content["sha256"][name]) for name in names}

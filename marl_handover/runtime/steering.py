@@ -7,7 +7,6 @@ is about to begin a transfer.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import stat
@@ -21,6 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from marl_handover.parsing import parse_json
 
 Floats = NDArray[np.float64]
 
@@ -141,10 +142,10 @@ class ControlFolder:
             if found.st_uid != os.getuid():
                 return Answer(-1, "", None, "the control file belongs to somebody else")
             with path.open("rb") as stream:
-                content = json.loads(stream.read(_LARGEST_BYTES))
+                content = parse_json(stream.read(_LARGEST_BYTES))
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, RecursionError) as error:
+        except (OSError, ValueError) as error:
             return Answer(-1, "", None, f"the control file cannot be read: {error}"[:200])
         return self._judged(content)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,9 @@ from numpy.typing import NDArray
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
+from marl_handover.files import read_bounded
 from marl_handover.geometry.urdf import ARM_JOINTS
+from marl_handover.parsing import LINES_BYTES, parse_json
 from marl_handover.task.rules import Outcome
 
 Floats = NDArray[np.float64]
@@ -172,15 +173,15 @@ class _Session:
 
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = read_bounded(path, LINES_BYTES, WHAT).decode("utf-8").splitlines()
+    except UnicodeDecodeError as error:
         raise CorruptFile(WHAT, path, str(error)) from error
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         try:
-            row = json.loads(line)
-        except (ValueError, RecursionError) as error:
+            row = parse_json(line, finite=False)
+        except ValueError as error:
             raise CorruptFile(WHAT, path, f"line {number} is not JSON") from error
         if not isinstance(row, dict):
             raise CorruptFile(WHAT, path, f"line {number} is not an object in braces")
