@@ -21,7 +21,7 @@ class EmulateConfig:
     """Keys of ``emulate``."""
 
     link: str = path_field("runs/ssc32")  # symlink to the port; give it as hardware.boards.main.port to a run
-    faults: str = ""  # kind@start_s[:duration_s][=amount], separated by commas; kinds: unplug brownout silent drop corrupt late stuck jam
+    faults: str = ""  # kind@start_s[:duration_s][=amount],...: unplug brownout silent drop corrupt late stuck ignore random frozen jam
     board: str = "main"  # which of the boards in hardware.boards
     lines: bool = False  # print every line that comes in
     hardware: HardwareConfig = field(default_factory=HardwareConfig)

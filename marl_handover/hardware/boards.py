@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from marl_handover.hardware.clock import Clock
-from marl_handover.hardware.errors import BadReply, PortLost, TooSlow, WrongState
+from marl_handover.hardware.errors import PortLost, TooSlow, WrongState
 from marl_handover.hardware.protocol import PULSE_US, SPEED_US_S, TIME_MS, group_move, stop
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.hardware.ssc32 import SentLine, Ssc32
 from marl_handover.hardware.transport import BITS_PER_BYTE
 from marl_handover.hardware.wiring import board_channels
-
-PULSE_TOLERANCE_US = 15
-"""A pulse read back, to 10 us, may be off by this much from the one sent."""
 
 STOP_WITHIN_S = 0.04
 """From the stop being latched to its last byte at a board, at worst."""
@@ -23,14 +20,15 @@ PulsesOfBoards = Mapping[str, Mapping[int, int]]
 
 
 class Boards:
-    """Every board that an arm is wired to; ``by_name`` holds each."""
+    """Every board that an arm is wired to; ``by_name`` holds each. ``attend``: see :class:`Ssc32`."""
 
-    def __init__(self, config: HardwareConfig, clock: Clock, *, dry_run: bool = False) -> None:
+    def __init__(self, config: HardwareConfig, clock: Clock, *, dry_run: bool = False, attend: Callable[[], object] = lambda: None) -> None:
         self.by_name = {
-            name: Ssc32(name, config.boards[name], config.timeouts, clock, log_entries=config.log_entries, dry_run=dry_run)
+            name: Ssc32(name, config.boards[name], config.timeouts, clock, log_entries=config.log_entries, dry_run=dry_run, attend=attend)
             for name in config.used_boards()
         }
         self._channels = {name: board_channels(config, name) for name in self.by_name}
+        self._tolerance_us = config.stream.pulse_tolerance_us
         self._look_s = config.stream.poll_s + config.stream.backlog_s
 
     def connect(self) -> None:
@@ -60,18 +58,15 @@ class Boards:
         """What all wired channels put out; None: no pulse, and so no known position."""
         return {name: board.pulses(self._channels[name]) for name, board in self.by_name.items()}
 
-    def require_powered(self, names: Iterable[str]) -> None:
-        """Ask one channel of each board for its pulse: a reset takes all. Raises :class:`BoardReset`."""
-        for name in names:
-            self.by_name[name].require_pulses(self._channels[name][:1])
+    def require_pulses(self) -> None:
+        """Ask whether every wired channel puts out what it was sent by now. Raises as :meth:`Ssc32.require_pulses`."""
+        for name, board in self.by_name.items():
+            board.require_pulses(self._channels[name], self._tolerance_us)
 
-    def verify(self, wanted: PulsesOfBoards) -> None:
-        """Whether the boards put out what they were sent. Raises :class:`BoardReset` or :class:`BadReply`."""
-        for name, pulses in wanted.items():
-            self.by_name[name].require_pulses(pulses)
-            for channel, pulse in self.by_name[name].pulses(pulses).items():
-                if pulse is None or abs(pulse - pulses[channel]) > PULSE_TOLERANCE_US:
-                    raise BadReply(f"QP{channel}", str(pulse).encode(), f"about {pulses[channel]} us, as was sent")
+    def stand(self, pulses: Mapping[str, Mapping[int, int | None]]) -> None:
+        """Take readings for where the channels stand. See :meth:`Ssc32.stands`."""
+        for name, found in pulses.items():
+            self.by_name[name].stands({channel: pulse for channel, pulse in found.items() if pulse is not None})
 
     def backlog_s(self, names: Iterable[str]) -> float:
         """How long the last byte written to any of these boards is still on its way."""

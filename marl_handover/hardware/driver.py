@@ -21,6 +21,7 @@ import numpy as np
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.hardware.clock import Clock
+from marl_handover.hardware.commanded import SETTLED_S
 from marl_handover.hardware.errors import HalfHeld, NotConfirmed, WrongState
 from marl_handover.hardware.gate import JointCommand
 from marl_handover.hardware.held import Pulses, all_held, middles, none_held
@@ -104,6 +105,7 @@ class ArmDriver(MovingSession):
             HalfHeld: only some channels have a pulse, and letting go did not help (a dry run lets nothing go).
             Stopped: somebody stopped the arms meanwhile.
             BoardReset: a board shows no pulse even after the move.
+            PulseMismatch: it shows others than it was sent.
         """
         if self.state not in (State.CONFIGURED, State.ARMED):
             raise WrongState("arm", self.state, State.CONFIGURED)
@@ -114,7 +116,7 @@ class ArmDriver(MovingSession):
             self._ask((_DRIVE if all_held(pulses) else _JUMP) + self._warning())
             sent = self._jump(commands) if none_held(pulses) else self._drive_parked(commands)
             if not self.dry_run:
-                self.boards.verify(self.wiring.pulses(commands))
+                self.check_pulses()
         return sent
 
     def rejoin(self) -> None:
@@ -208,7 +210,7 @@ class ArmDriver(MovingSession):
             wanted[wiring.board].update({channel: within[wiring.board][channel] for channel in wiring.channels})
         with self._allowed(State.ARMING):
             self.boards.first_move(wanted, round(1000 * _RESTATED_S))
-        self.wait(_RESTATED_S)
+        self.settle(_RESTATED_S + SETTLED_S)
 
     def _leave(self, broken: bool) -> None:
         try:

@@ -102,6 +102,20 @@ class BoardReset(DeviceError):
         )
 
 
+class PulseMismatch(DeviceError):
+    """A board puts out another pulse than it was sent: it does not carry out its moves, or answers anything."""
+
+    def __init__(self, board: str, channel: int, pulse_us: int, wanted_us: tuple[float, float], tolerance_us: float) -> None:
+        self.board, self.channel, self.pulse_us, self.wanted_us = board, channel, pulse_us, wanted_us
+        lower, upper = (f"{end:.0f}" for end in wanted_us)
+        wanted = f"{lower} us" if lower == upper else f"{lower} to {upper} us"
+        super().__init__(
+            f"board {board}, channel {channel} puts out {pulse_us} us, where it was sent {wanted} (tolerance {tolerance_us:g} us): the "
+            "board does not do what it is told, or does not say what it does. Every channel was told to stop; check the board, its supply "
+            "and its cable, then arm again"
+        )
+
+
 class TooSlow(DeviceError):
     """A board's line is too slow to stop its arms in time."""
 

@@ -13,7 +13,7 @@ from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration
 from marl_handover.hardware.errors import BoardReset
 from marl_handover.hardware.gate import GateRejection, Reason
-from marl_handover.hardware.protocol import PULSE_US
+from marl_handover.hardware.protocol import PULSE_US, READING_US
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.hardware.wiring import finger_mm
 
@@ -21,9 +21,6 @@ Floats = NDArray[np.float64]
 
 Pulses = Mapping[str, Mapping[int, int | None]]
 """Board -> channel -> pulse in us, to 10 us; None where there is none."""
-
-READING_US = 10
-"""A reading stands for any pulse from itself to less than this above."""
 
 
 def all_held(pulses: Pulses) -> bool:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.hardware.commanded import SETTLED_S
 from marl_handover.hardware.errors import BadCommand, WrongState
 from marl_handover.hardware.gate import JointCommand
 from marl_handover.hardware.session import BoardSession, State
@@ -40,6 +41,7 @@ class MovingSession(BoardSession):
         Raises:
             GateRejection: it must not be sent.
             Stopped: the stop is latched; every channel was told to stop.
+            PulseMismatch: a board does not do what it is told; every channel was told to stop.
             BoardReset, PortLost, BadReply: the electronics failed; the arms have to be armed again, or the port connected.
         """
         return self._move(commands, duration_s, made_s, State.ARMED)
@@ -84,6 +86,7 @@ class MovingSession(BoardSession):
             sent = self._move([JointCommand(arm, row[:5], float(row[5])) for arm, row in rows.items()], step_s, None, needs)
             lines += sent.lines
             self.wait(step_s)
+        self.settle(SETTLED_S)
         return Sent(tuple(lines), sent.joints_rad, steps * step_s)
 
     def _move(self, commands: Sequence[JointCommand], duration_s: float, made_s: float | None, needs: State) -> Sent:
@@ -94,7 +97,7 @@ class MovingSession(BoardSession):
         with self._watched():
             if stream.check_reset:
                 # All of them: what one arm may do depends on where the other is, and that is known while its board holds it.
-                self.boards.require_powered(self.boards.by_name)
+                self.check_pulses()
             while (backlog_s := self.boards.backlog_s(self.boards.by_name)) > stream.backlog_s:
                 self.wait(max(backlog_s - stream.backlog_s, stream.poll_s))
             with self._allowed(needs):

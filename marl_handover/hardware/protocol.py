@@ -17,6 +17,9 @@ from marl_handover.hardware.errors import BadCommand, BadReply, DuplicateChannel
 
 CHANNELS = 32
 PULSE_US = (500, 2500)
+READING_US = 10
+"""A pulse as boards tell it stands for any from itself to less than this above."""
+
 SPEED_US_S = (1, 65535)
 TIME_MS = (1, 65535)
 OFFSET_US = (-100, 100)

@@ -12,7 +12,7 @@ from marl_handover.config import MotionConfig
 from marl_handover.hardware.boards import Boards
 from marl_handover.hardware.calibration import ArmCalibration, calibrations
 from marl_handover.hardware.clock import Clock, RealClock
-from marl_handover.hardware.errors import BoardReset, DeviceError, PortLost, Stopped, WrongState
+from marl_handover.hardware.errors import BoardReset, DeviceError, PortLost, PulseMismatch, Stopped, WrongState
 from marl_handover.hardware.gate import JointCommand, SafetyGate
 from marl_handover.hardware.held import Pulses, require_held, stands
 from marl_handover.hardware.latch import StopLatch
@@ -21,6 +21,9 @@ from marl_handover.hardware.signals import Endings, deferred
 from marl_handover.hardware.wiring import Wiring
 
 _RETRY_S = 0.2
+
+_PATIENCE_S = 0.15
+"""A board that carries out a move later than it should is waited for: a busy computer may have kept its line back. Arms hold meanwhile."""
 
 
 class State(enum.StrEnum):
@@ -53,7 +56,7 @@ class BoardSession:
         self.clock: Clock = clock or RealClock()
         self.latch = latch or StopLatch(config.stop_path())
         self.dry_run, self.state = dry_run, State.DISCONNECTED
-        self.boards = Boards(config, self.clock, dry_run=dry_run)
+        self.boards = Boards(config, self.clock, dry_run=dry_run, attend=self.obey)
         self.calibrations: tuple[ArmCalibration, ...] = ()
         self._gate: SafetyGate | None = None
         self._wiring: Wiring | None = None
@@ -137,6 +140,30 @@ class BoardSession:
                 return
             self.clock.sleep_s(min(self.config.stream.poll_s, left_s))
 
+    def check_pulses(self) -> None:
+        """Ask whether every channel puts out what it was sent by now, and wait a little for boards that are late.
+
+        Raises:
+            PulseMismatch: one does not; every channel was told to stop, and moves are refused until :meth:`resume`.
+            BoardReset, PortLost, BadReply: the electronics failed.
+            Stopped: the stop is latched.
+        """
+        end_s = self.clock.now_s() + _PATIENCE_S
+        with self._watched():
+            while True:
+                try:
+                    return self.boards.require_pulses()
+                except PulseMismatch:
+                    if self.clock.now_s() >= end_s:
+                        raise
+                self.wait(self.config.stream.poll_s)
+
+    def settle(self, duration_s: float) -> None:
+        """Wait until moves are over, and see that they were carried out. Raises as :meth:`check_pulses`."""
+        self.wait(duration_s)
+        if self.config.stream.check_reset:
+            self.check_pulses()
+
     def obey(self) -> None:
         """If the stop is latched, stop every channel and raise :class:`Stopped`."""
         if self.latch.is_set():
@@ -209,6 +236,9 @@ class BoardSession:
             self.gate.forget()
             self.state = State.CONFIGURED
             raise
+        except PulseMismatch:
+            self.halt()
+            raise
 
     @contextlib.contextmanager
     def _allowed(self, needs: State) -> Iterator[None]:
@@ -233,6 +263,7 @@ class BoardSession:
         Raises :class:`BoardReset` if a channel has no pulse, and :class:`GateRejection` if an arm is held outside its limits.
         """
         require_held(pulses)
+        self.boards.stand(pulses)
         held = [stands(self.config, self.calibrations, self.model.arm, pulses, arm) for arm in range(len(ARMS))]
         stay = [JointCommand(arm, joints, fingers) for arm, (joints, fingers) in enumerate(held)]
         for command in stay:

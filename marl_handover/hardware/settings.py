@@ -99,7 +99,8 @@ class StreamConfig:
     backlog_s: float = 0.002  # a move is not written before what is still on the way takes less than this
     late_s: float = 0.3  # watchdog: a motion that falls behind by more is given up
     settle_s: float = 0.3  # after the last move, for the servos to arrive
-    check_reset: bool = True  # ask for a pulse before each group move: none means that the board was reset
+    check_reset: bool = True  # ask for all pulses before each group move: none means a reset; another than sent, a board that disobeys
+    pulse_tolerance_us: float = 15.0  # a pulse may be told so far from what was sent: a servo's dead band is as wide
 
 
 @dataclass
@@ -203,6 +204,7 @@ class HardwareConfig:
         require_between("hardware.stream.backlog_s", stream.backlog_s, 0, 0.01)
         require_positive("hardware.stream.late_s", stream.late_s)
         require_at_least("hardware.stream.settle_s", stream.settle_s, 0)
+        require_between("hardware.stream.pulse_tolerance_us", stream.pulse_tolerance_us, 5, 200)
         for name in ("reply_s", "write_s", "reconnect_s"):
             require_positive(f"hardware.timeouts.{name}", getattr(times, name))
         require_at_least("hardware.timeouts.retries", times.retries, 0)

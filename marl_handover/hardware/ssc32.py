@@ -8,9 +8,19 @@ from typing import NamedTuple, TypeVar
 
 from marl_handover.hardware import protocol
 from marl_handover.hardware.clock import Clock
-from marl_handover.hardware.errors import BadReply, BoardReset, BoardSilent, NoReference, PortLost, UnsuitableFirmware, WrongState
+from marl_handover.hardware.commanded import Commanded, Span
+from marl_handover.hardware.errors import (
+    BadReply,
+    BoardReset,
+    BoardSilent,
+    NoReference,
+    PortLost,
+    PulseMismatch,
+    UnsuitableFirmware,
+    WrongState,
+)
 from marl_handover.hardware.ports import choose_port
-from marl_handover.hardware.settings import BoardConfig, TimeoutConfig
+from marl_handover.hardware.settings import BoardConfig, StreamConfig, TimeoutConfig
 from marl_handover.hardware.transport import Logged, Wire
 
 T = TypeVar("T")
@@ -41,10 +51,19 @@ class Ssc32:
         clock: time.
         log_entries: length of the byte log.
         dry_run: write queries and stops only.
+        attend: is called time and again while an answer is waited for; it may raise.
     """
 
     def __init__(
-        self, name: str, config: BoardConfig, timeouts: TimeoutConfig, clock: Clock, *, log_entries: int = 20_000, dry_run: bool = False
+        self,
+        name: str,
+        config: BoardConfig,
+        timeouts: TimeoutConfig,
+        clock: Clock,
+        *,
+        log_entries: int = 20_000,
+        dry_run: bool = False,
+        attend: Callable[[], object] = lambda: None,
     ) -> None:
         self.name, self.config, self.dry_run = name, config, dry_run
         self.firmware: protocol.Firmware | None = None
@@ -52,6 +71,7 @@ class Ssc32:
         self._log: deque[Logged] = deque(maxlen=log_entries)
         self._wire: Wire | None = None
         self._known: set[int] = set()
+        self._commanded, self._attend = Commanded(), attend
 
     @property
     def wire(self) -> Wire:
@@ -93,7 +113,7 @@ class Ssc32:
         if self._wire is not None:
             self._wire.close()
         self._wire, self.firmware = None, None
-        self._known.clear()
+        self._forget()
 
     def pulses(self, channels: Iterable[int]) -> dict[int, int | None]:
         """What the board puts out, in us to 10 us; None for channels without a pulse, whose position it does not know.
@@ -116,15 +136,40 @@ class Ssc32:
         """A register's value."""
         return self._asked(protocol.read_register(register), 8, protocol.parse_register, until=protocol.CR)
 
-    def require_pulses(self, channels: Iterable[int]) -> None:
-        """Raise :class:`BoardReset` if channels that were moved before have no pulse now: a first move is then due again."""
+    def require_pulses(self, channels: Iterable[int], tolerance_us: float = StreamConfig.pulse_tolerance_us) -> None:
+        """Ask whether channels put out what they were sent by now.
+
+        A damaged byte may well look like a pulse: a bad answer is asked for again before it is believed. Nothing is asked in a dry run.
+
+        Raises:
+            BoardReset: channels have no pulse: a first move is then due again.
+            PulseMismatch: one has another pulse than it was sent, by more than ``tolerance_us``, or another at each question.
+            BadReply: the answers are none.
+        """
         listed = list(channels)
-        if self.dry_run or None not in self._pulses_once(listed).values():
+        if self.dry_run:
             return
-        silent = [channel for channel, pulse in self.pulses(listed).items() if pulse is None]
-        if silent:
-            self._known.clear()
-            raise BoardReset(self.name, silent)
+        before: dict[int, int | None] | None = None
+        for _ in range(2 + self._timeouts.retries):
+            asked_s = self._clock.now_s()
+            now = self._pulses_once(listed)
+            astray = self._astray(now, (asked_s, self._clock.now_s()), tolerance_us)
+            if None not in now.values() and astray is None:
+                return
+            agreed = before is not None and all(_same(before[channel], now[channel]) for channel in listed)
+            silent = [channel for channel in listed if now[channel] is None]
+            if agreed and silent:
+                self._forget()
+                raise BoardReset(self.name, silent)
+            if agreed and astray is not None:
+                raise astray
+            before = now
+        raise astray or BadReply("QP", repr(before).encode(), "the same pulses twice")
+
+    def stands(self, pulses_us: Mapping[int, int]) -> None:
+        """Take readings of channels that stand still for what they put out, whatever they were sent before."""
+        for channel, pulse in pulses_us.items():
+            self._commanded.hold(channel, Span(pulse, pulse + protocol.READING_US))
 
     def referenced(self, channels: Iterable[int]) -> bool:
         """Whether the first move of all these channels is done."""
@@ -132,7 +177,7 @@ class Ssc32:
 
     def first_move(self, pulses_us: Mapping[int, int], time_ms: int | None) -> SentLine:
         """Send channels to where they are known to stand. The board ignores ``time_ms`` for channels without a pulse, and jumps."""
-        sent = self._send(protocol.group_move(pulses_us, time_ms))
+        sent = self._send_move(pulses_us, time_ms, {})
         self._known.update(pulses_us)
         return sent
 
@@ -141,22 +186,48 @@ class Ssc32:
         unknown = [channel for channel in pulses_us if channel not in self._known]
         if unknown:
             raise NoReference(self.name, unknown)
-        return self._send(protocol.group_move(pulses_us, time_ms, speeds_us_s))
+        return self._send_move(pulses_us, time_ms, speeds_us_s or {})
 
     def stop(self, channels: Iterable[int]) -> SentLine:
         """Stop channels where they are. Written even in a dry run."""
-        data = protocol.stop(channels)
-        return SentLine(self.name, self.wire.write(data), data, True)
+        listed = list(channels)
+        data = protocol.stop(listed)
+        written_s = self.wire.write(data)
+        self._commanded.stop(listed, written_s, self._clock.now_s() + self.wire.backlog_s())
+        return SentLine(self.name, written_s, data, True)
 
     def limp(self, channels: Iterable[int]) -> SentLine:
         """No more pulses: arms sink, but for a dry run. The next move is a first one."""
         listed = list(channels)
         self._known.difference_update(listed)
+        self._commanded.forget(listed)
         return self._send(protocol.encode_line([protocol.Level(channel, False) for channel in listed]))
 
     def _pulses_once(self, listed: list[int]) -> dict[int, int | None]:
         answer = self._asked(protocol.query_pulses(listed), len(listed), lambda reply: protocol.parse_pulses(reply, len(listed)))
         return dict(zip(listed, answer, strict=True))
+
+    def _astray(self, found: Mapping[int, int | None], taken_s: tuple[float, float], tolerance_us: float) -> PulseMismatch | None:
+        """The first reading, taken between two times, that cannot be what its channel was sent."""
+        for channel, pulse in found.items():
+            span = self._commanded.span(channel, *taken_s)
+            if span is None or pulse is None:
+                continue
+            if not span.lower - protocol.READING_US - tolerance_us <= pulse <= span.upper + tolerance_us:
+                return PulseMismatch(self.name, channel, pulse, span, tolerance_us)
+        return None
+
+    def _forget(self) -> None:
+        """Every channel counts as never moved."""
+        self._known.clear()
+        self._commanded.forget()
+
+    def _send_move(self, pulses_us: Mapping[int, int], time_ms: int | None, speeds_us_s: Mapping[int, int]) -> SentLine:
+        sent = self._send(protocol.group_move(pulses_us, time_ms, speeds_us_s))
+        if sent.written:
+            heard_s = self._clock.now_s() + self.wire.backlog_s()
+            self._commanded.move(pulses_us, (time_ms or 0) / 1000, speeds_us_s, sent.t_s, heard_s)
+        return sent
 
     def _send(self, line: bytes) -> SentLine:
         if self.dry_run:
@@ -172,11 +243,8 @@ class Ssc32:
         for baud in bauds:
             wire.set_baud(baud)
             for _ in range(1 + self._timeouts.retries):
-                # An old fragment would glue itself to the question; a board that is just starting may miss the first one.
-                reply = wire.ask(protocol.CANCEL + protocol.VERSION, protocol.MAX_VERSION_BYTES, until=protocol.CR)
-                try:
-                    firmware = protocol.parse_version(reply)
-                except BadReply:
+                firmware, reply = _version(wire)
+                if firmware is None:
                     odd = reply or odd
                     continue
                 if not firmware.has_stop:
@@ -189,7 +257,7 @@ class Ssc32:
     def _asked(self, question: bytes, size: int, parse: Callable[[bytes], T], until: bytes = b"") -> T:
         """A checked answer. After a bad one the line is made quiet and the board asked who it is, so that nothing late is taken for it."""
         for attempt in range(1 + self._timeouts.retries):
-            reply = self.wire.ask(question, size, until=until)
+            reply = self.wire.ask(question, size, until=until, attend=self._attend)
             try:
                 return parse(reply)
             except BadReply:
@@ -201,11 +269,22 @@ class Ssc32:
     def _resynchronise(self) -> None:
         """Make sure that what comes next answers what is asked next. Raises :class:`PortLost` if the board does not come back."""
         for _ in range(1 + self._timeouts.retries):
-            self.wire.drain(QUIET_S)
-            reply = self.wire.ask(protocol.CANCEL + protocol.VERSION, protocol.MAX_VERSION_BYTES, until=protocol.CR)
-            if self.firmware is not None and reply == self.firmware.text.encode() + protocol.CR:
+            self.wire.drain(QUIET_S, self._attend)
+            if self.firmware is not None and _version(self.wire, self._attend)[0] == self.firmware:
                 return
         raise PortLost(self.wire.port, "asking the board", "it no longer answers")
+
+
+def _version(wire: Wire, attend: Callable[[], object] | None = None) -> tuple[protocol.Firmware | None, bytes]:
+    """What a board says that it is, None if that is no SSC-32, and the answer itself."""
+    # An old fragment would glue itself to the question; a board that is just starting may miss the first one.
+    reply = wire.ask(protocol.CANCEL + protocol.VERSION, protocol.MAX_VERSION_BYTES, until=protocol.CR, attend=attend)
+    try:
+        firmware = protocol.parse_version(reply)
+    except BadReply:
+        return None, reply
+    wire.drain(QUIET_S, attend)  # some say more on a second line
+    return firmware, reply
 
 
 def _same(before: int | None, now: int | None) -> bool:

@@ -68,7 +68,7 @@ def stream(
     Raises:
         InvalidSetting: a motion does not begin where its arm is.
         Stalled: the host fell behind by more than ``stream.late_s``; the arms hold.
-        GateRejection, Stopped, BoardReset, PortLost, BadReply: as :meth:`ArmDriver.move`.
+        GateRejection, Stopped, PulseMismatch, BoardReset, PortLost, BadReply: as :meth:`ArmDriver.move`.
     """
     settings, clock = driver.config.stream, driver.clock
     tracks = [_track(driver, arm, phases) for arm, phases in motions.items() if phases]
@@ -84,7 +84,7 @@ def stream(
         if late_s > settings.late_s:
             raise Stalled(late_s, settings.late_s)
         if called_off is not None and called_off():
-            driver.wait(settings.period_s + settings.settle_s)
+            driver.settle(settings.period_s + settings.settle_s)
             return Streamed(moves, latest_s, False)
         t_s = begin_s + (number + 1) * settings.period_s
         driver.move([track.at(t_s) for track in tracks if track.t_s[0] < t_s < track.t_s[-1] + settings.period_s], settings.period_s)
@@ -93,7 +93,7 @@ def stream(
         moves += 1
         if on_tick is not None:
             on_tick(min(t_s, end_s))
-    driver.wait(settings.period_s + settings.settle_s)
+    driver.settle(settings.period_s + settings.settle_s)
     return Streamed(moves, latest_s, True)
 
 

@@ -6,7 +6,7 @@ import contextlib
 import termios
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import serial
@@ -18,6 +18,9 @@ from marl_handover.hardware.protocol import CANCEL
 from marl_handover.hardware.settings import TimeoutConfig
 
 BITS_PER_BYTE = 10
+ATTEND_S = 0.004
+"""Nobody who waits for an answer is out of reach for longer."""
+
 _SCHEMES = "marl_handover.hardware.emulator"
 _FAILURES = (serial.SerialException, OSError, termios.error)
 """Of a port that was pulled out: pyserial lets ``in_waiting`` raise a bare OSError, and flushing termios's own error, which is none."""
@@ -102,10 +105,13 @@ class Wire:
         """How long what was written is still on its way."""
         return max(0.0, self._free_s - self._clock.now_s())
 
-    def ask(self, question: bytes, size: int, *, until: bytes = b"", timeout_s: float | None = None) -> bytes:
+    def ask(
+        self, question: bytes, size: int, *, until: bytes = b"", timeout_s: float | None = None, attend: Callable[[], object] | None = None
+    ) -> bytes:
         """Send a question and read what comes back: up to ``size`` bytes, up to the first ``until``, or whatever there is at the timeout.
 
-        What had come in before is thrown away: it answers nothing that was asked now.
+        What had come in before is thrown away: it answers nothing that was asked now. ``attend`` is called every :data:`ATTEND_S` while
+        the answer is waited for; what it raises ends the waiting.
         """
         with self._asking, self._guarded("reading"):
             self._serial.reset_input_buffer()
@@ -116,19 +122,26 @@ class Wire:
                 left_s = end_s - self._clock.now_s()
                 if left_s <= 0:
                     break
-                self._serial.timeout = left_s
+                self._serial.timeout = left_s if attend is None else min(left_s, ATTEND_S)
                 reply += self._serial.read(1 if until else size - len(reply))
+                if attend is not None:
+                    attend()
             if reply:
                 self.log.append(Logged(self._clock.now_s(), "<", bytes(reply)))
             return bytes(reply)
 
-    def drain(self, quiet_s: float) -> None:
-        """Throw away what comes in, until nothing has for ``quiet_s``, or a second has passed."""
+    def drain(self, quiet_s: float, attend: Callable[[], object] | None = None) -> None:
+        """Throw away what comes in, until nothing has for ``quiet_s``, or a second has passed. ``attend``: as of :meth:`ask`."""
         with self._asking, self._guarded("reading"):
-            self._serial.timeout = quiet_s
-            end_s = self._clock.now_s() + 1.0
-            while self._serial.read(256) and self._clock.now_s() < end_s:
-                pass
+            self._serial.timeout = quiet_s if attend is None else min(quiet_s, ATTEND_S)
+            now_s = self._clock.now_s()
+            end_s, quiet_since_s = now_s + 1.0, now_s
+            while now_s < end_s and now_s - quiet_since_s < quiet_s:
+                heard = self._serial.read(256)
+                now_s = self._clock.now_s()
+                quiet_since_s = now_s if heard else quiet_since_s
+                if attend is not None:
+                    attend()
 
     def close(self) -> None:
         """Let the port go, whatever state it is in."""

@@ -48,6 +48,7 @@ class Event(StrEnum):
     BAD_REPLY = "bad_reply"  # arms hold; the motion goes on from there
     HOST_LATE = "host_late"  # the same
     GATE_REFUSED = "gate_refused"  # the command is not sent; the arm goes home, or stays for somebody to help
+    PULSE_MISMATCH = "pulse_mismatch"  # a board does not do what it is told: every channel is stopped, the session ends
     ARM_STALLED = "arm_stalled"  # one arm does nothing, time and again: the episode ends
     STOPPED = "stopped"  # the latched stop: every channel is stopped, the session ends
     RECOVERED = "recovered"  # what was wrong is over

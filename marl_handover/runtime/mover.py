@@ -8,7 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.hardware.errors import BadReply, BoardReset, DeviceError, NotConfirmed, PortLost, Stalled, Stopped, WrongState
+from marl_handover.hardware.errors import (
+    BadReply,
+    BoardReset,
+    DeviceError,
+    NotConfirmed,
+    PortLost,
+    PulseMismatch,
+    Stalled,
+    Stopped,
+    WrongState,
+)
 from marl_handover.hardware.gate import GateRejection
 from marl_handover.hardware.session import State
 from marl_handover.hardware.streaming import stream
@@ -27,6 +37,9 @@ _ASTRAY_S = 0.2
 _RETRY_S = 0.5
 _COMMITTED_S = 0.25
 """So long before the hand is at the pin it goes on, whatever is seen: it hides the block."""
+
+_FINAL = (Stopped, PulseMismatch)
+"""Every channel was told to stop, and this session moves nothing any more."""
 
 
 class Mover:
@@ -64,8 +77,16 @@ class Mover:
 
         Raises:
             Stopped: the stop is latched.
+            PulseMismatch: a board does not do what it is told.
             DeviceError: the electronics cannot be brought up again.
         """
+        try:
+            return self._play(arm, phases, called_off)
+        except PulseMismatch as failure:
+            self.log.add(Event.PULSE_MISMATCH, text=failure)
+            raise
+
+    def _play(self, arm: int, phases: Sequence[Phase], called_off: Callable[[float], bool] | None) -> bool:
         try:
             self.ready()
         except (BoardReset, PortLost):
@@ -80,7 +101,7 @@ class Mover:
                     return self._turn_back(arm, aimed[0])
                 self.play_out.done(arm, phases[-1].joints_rad[-1], aimed[-1].joints_rad[-1])
                 return True
-            except Stopped:
+            except _FINAL:
                 raise
             except BoardReset as failure:
                 self.log.add(Event.CONTROLLER_RESET, text=failure)
@@ -119,7 +140,7 @@ class Mover:
         back = Phase("back", t_s - t_s[0], approach.joints_rad[gone][::-1], approach.gripper_mm[gone][::-1])
         try:
             stream(self.driver, {arm: [back]}, on_tick=lambda t_s: None)
-        except Stopped:
+        except _FINAL:
             raise
         except (GateRejection, DeviceError):
             return self._start_over() if self.driver.state is not State.ARMED else self._go_home(arm, [approach])
@@ -134,7 +155,7 @@ class Mover:
                     self.driver.reconnect()
                 self.driver.arm()
                 break
-            except (NotConfirmed, Stopped, GateRejection):
+            except (NotConfirmed, GateRejection, *_FINAL):
                 raise
             except DeviceError:
                 if self.lab.clock.now_s() >= end_s:
@@ -175,7 +196,7 @@ class Mover:
                 raise WrongState("drive home", "holding the block", "an empty hand")
             self.driver.drive(arm, self.driver.parked_rad, self.driver.gripper_mm(arm), self.driver.config.park_deg_s)
             self.play_out.lead_rad[arm] = 0.0
-        except Stopped:
+        except _FINAL:
             raise
         except (GateRejection, DeviceError):
             if self.driver.state is State.ARMED:

@@ -282,3 +282,20 @@ def test_a_million_random_bytes():
     source, left = random.Random(0), 1_000_000
     while left > 0:
         left -= fuzz([b"SSC32-V2.50USB\r", *(source.randbytes(source.randrange(400)) for _ in range(60))])
+
+
+@pytest.mark.parametrize(
+    "said", [b"SSC32-V2.50USB rev.2\r", b"SSC32-V2.50USB\rbuilt 2014\r", b"  SSC32-V2.03XE \r", b"\nSSC32-V2.50USB \r"]
+)
+def test_words_around_the_version_are_understood_after_a_damaged_answer_too(said):
+    """What the handshake takes for a board is what it is recognised by later."""
+    board, _, _ = made(board=Liar(iter([said, b"\x01", said, b"\x96", b"\x96"])))
+    assert board.connect().number >= (2, 3)
+    assert board.pulses([0]) == {0: 1500}
+
+
+def test_another_board_at_the_same_port_is_not_taken_for_the_first():
+    board, _, _ = made(board=Liar(iter([b"SSC32-V2.50USB\r", b"\x01", *[b"SSC32-V2.03XE\r"] * 9])))
+    board.connect()
+    with pytest.raises(PortLost, match="no longer answers"):
+        board.pulses([0])

@@ -107,7 +107,7 @@ def test_a_late_host_does_not_hurry_the_arms(armed, late_s, where):
     swing = rig.driver.parked_rad + np.outer(1.2 * (1 - np.cos(np.linspace(0, np.pi, 51))) / 2, [1, 0, 0, 0, 0])
     phases = [Phase("transfer", np.linspace(0, 1.0, 51), swing, np.full(51, 12.0))]
     planned_deg_s = math.degrees(np.abs(np.diff(swing[:, 0])).max() / 0.02)
-    pulses, hangs, ask = [], [late_s], rig.driver.boards.require_powered
+    pulses, hangs, ask = [], [late_s], rig.driver.boards.require_pulses
 
     def look():
         pulses.append(rig.device.outputs_us(rig.clock.now_s())[0])
@@ -117,12 +117,12 @@ def test_a_late_host_does_not_hurry_the_arms(armed, late_s, where):
         if len(pulses) > 23 and hangs:
             rig.clock.sleep_s(hangs.pop())
 
-    def slow(names):
+    def slow():
         hang(0)
-        ask(names)
+        ask()
 
     rig.clock.at(rig.clock.now_s() + 0.001, look)
-    rig.driver.boards.require_powered = slow if where == "asking" else ask
+    rig.driver.boards.require_pulses = slow if where == "asking" else ask
     began_s = rig.clock.now_s()
     report = stream(rig.driver, {0: phases}, on_tick=hang if where == "on_tick" else None)
     assert report.finished

@@ -11,7 +11,7 @@ import random
 import re
 from typing import NamedTuple
 
-from marl_handover.hardware.protocol import CHANNELS, CR, ESC, OFFSET_US, PULSE_US, parse_version
+from marl_handover.hardware.protocol import CHANNELS, CR, ESC, OFFSET_US, PULSE_US, READING_US, parse_version
 
 FRAME_S = 0.02
 
@@ -87,6 +87,10 @@ class Board:
         self.volts = dict.fromkeys("ABCDEFGH", 0.0)
         self.stuck = False
         """Whether ``Q`` answers "moving" for ever, as some boards do at times."""
+        self.ignored, self.guessed = 0.0, 0.0
+        """The share of moves that are not carried out, and of pulses that are told at random."""
+        self.told: list[int] | None = None
+        """What ``QP`` tells of each channel, whatever it puts out; None: the truth."""
         self._random = random.Random(seed)
         self.power_up(0.0)
 
@@ -121,6 +125,11 @@ class Board:
     def frame(self, t_s: float) -> int:
         """Number of the frame that is put out at a time."""
         return max(0, math.floor((t_s - self.on_since_s) / FRAME_S + 1e-9))
+
+    def freeze_told(self, t_s: float) -> None:
+        """From now on ``QP`` tells what it would now."""
+        self.told = None
+        self.told = [self._tens(number, self.frame(t_s)) for number in range(CHANNELS)]
 
     def outputs_us(self, t_s: float) -> list[float]:
         """What the servos get, channel by channel; 0: no pulse."""
@@ -172,6 +181,8 @@ class Board:
 
     def _move(self, moves: str, time_ms: str | None, frame: int) -> None:
         """A move or group move: everything that has a position begins and ends together."""
+        if self.ignored and self._random.random() < self.ignored:
+            return
         wanted: dict[int, tuple[int, int]] = {}
         for number, pulse, speed in _MOVE.findall(moves):
             if not _is_channel(number) or len(pulse) > _DIGITS or len(speed) > _DIGITS:
@@ -223,6 +234,10 @@ class Board:
 
     def _tens(self, number: int, frame: int) -> int:
         """A pulse as ``QP`` says it. Firmware before 2.00 forgot to take the offset out."""
+        if self.guessed and self._random.random() < self.guessed:
+            return self._random.randint(PULSE_US[0] // READING_US, PULSE_US[1] // READING_US)
+        if self.told is not None:
+            return self.told[number]
         channel = self.channels[number]
         pulse = channel.commanded(frame)
         return int((pulse + channel.offset_us * (self.firmware.number < (2, 0))) / 10 + 1e-9) if pulse else 0

@@ -147,6 +147,14 @@ class Device:
                 self.baud = self.board.baud or self.baud
         elif fault.kind == "stuck":
             self.board.stuck = begins
+        elif fault.kind == "ignore":
+            self.board.ignored = fault.amount if begins else 0.0
+        elif fault.kind == "random":
+            self.board.guessed = fault.amount if begins else 0.0
+        elif fault.kind == "frozen":
+            self.board.told = None
+            if begins:
+                self.board.freeze_told(self._now_s)
         elif fault.kind == "jam" and int(fault.amount) in self.servos:
             self.servos[int(fault.amount)].jammed = begins
 

@@ -16,9 +16,12 @@ KINDS = {
     "corrupt": "reply bytes change, each with the given probability (0.5)",
     "late": "replies come the given time late (0.25 s)",
     "stuck": "Q says that a move goes on, for ever",
+    "ignore": "moves are not carried out, each with the given probability (1)",
+    "random": "QP answers pulses at random, each with the given probability (1)",
+    "frozen": "QP answers what it did when the fault began",
     "jam": "the servo of the given channel (0) is held fast",
 }
-_USUAL = {"drop": 1.0, "corrupt": 0.5, "late": 0.25, "jam": 0.0}
+_USUAL = {"drop": 1.0, "corrupt": 0.5, "late": 0.25, "jam": 0.0, "ignore": 1.0, "random": 1.0}
 
 
 @dataclass(frozen=True)
