@@ -21,11 +21,16 @@ EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 1, 2, 130, 141
 
 
 class Command(NamedTuple):
-    """Where a command lives. The module also offers ``SCHEMA``, ``ALIASES`` and ``GROUPS``."""
+    """Where a command lives. The module also offers ``SCHEMA``, ``ALIASES`` and ``GROUPS``.
+
+    ``first`` names a module whose ``at_once(arguments)`` is called before anything else is imported; the function gets what it returned as
+    a second argument.
+    """
 
     summary: str
     module: str
     function: str = "run"
+    first: str = ""
 
 
 COMMANDS: dict[str, Command] = {
@@ -41,7 +46,9 @@ COMMANDS: dict[str, Command] = {
     "simulate": Command("play episodes in the PyBullet cell: text, MP4 or GIF", "marl_handover.commands.simulate"),
     "calibrate": Command("camera and servos of a cell, or of its twin: measured, saved and checked", "marl_handover.commands.calibrate"),
     "run": Command("the closed loop on hardware or its twin; dry_run=true moves nothing", "marl_handover.commands.run"),
-    "stop": Command("stop all arms, and keep them stopped until clear=true", "marl_handover.commands.stop"),
+    "stop": Command(
+        "stop all arms, and keep them stopped until clear=true", "marl_handover.commands.stop", first="marl_handover.commands.stop_now"
+    ),
     "emulate": Command("a servo controller on a pseudo-terminal, with faults if wanted", "marl_handover.commands.emulate"),
     "view": Command("the cell in a browser: to play with, a trace, a session", "marl_handover.commands.view"),
     "plot": Command("a figure of a run, a trace or a cell", "marl_handover.commands.plot"),
@@ -102,6 +109,7 @@ def _guarded(name: str, arguments: list[str]) -> int:
 
 def _dispatch(name: str, arguments: list[str]) -> int:
     command = COMMANDS[name]
+    begun = (importlib.import_module(command.first).at_once(arguments),) if command.first else ()
     module: Any = importlib.import_module(command.module)
     from marl_handover.compose import compose, keys_help
 
@@ -112,7 +120,7 @@ def _dispatch(name: str, arguments: list[str]) -> int:
         if argument.startswith("-"):
             raise BadOverride(argument, "options are written key=value, without dashes; see --help")
     config = compose(module.SCHEMA, arguments, groups=module.GROUPS, aliases=module.ALIASES)
-    return int(getattr(module, command.function)(config))
+    return int(getattr(module, command.function)(config, *begun))
 
 
 def _take_debug(arguments: list[str]) -> tuple[bool, list[str]]:

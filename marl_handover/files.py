@@ -18,12 +18,12 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 from marl_handover.errors import CannotWrite, CorruptFile, InvalidSetting, MissingFile
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 LOG = logging.getLogger(__name__)
 Parsed = TypeVar("Parsed")
@@ -126,6 +126,8 @@ def read_arrays(path: Path, limit_bytes: int, what: str) -> dict[str, NDArray[An
     Raises:
         MissingFile, CorruptFile: as there; and it is damaged, none, or would take more than ``limit_bytes`` of memory.
     """
+    import numpy as np  # here: a stop writes a file, and must not wait for numpy
+
     with open_bounded(path, limit_bytes, what) as stream:
         try:
             with zipfile.ZipFile(stream) as archive:
@@ -140,6 +142,8 @@ def read_arrays(path: Path, limit_bytes: int, what: str) -> dict[str, NDArray[An
 
 def _require_small(archive: zipfile.ZipFile, limit_bytes: int) -> None:
     """Raise for an archive that is large when unpacked, or whose arrays say that they are larger than they are."""
+    import numpy as np
+
     unpacked = sum(member.file_size for member in archive.infolist())
     if unpacked > limit_bytes:
         raise OverflowError(f"it unpacks to {unpacked} bytes, more than the {limit_bytes} that it may have")

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from marl_handover.errors import CorruptFile
 from marl_handover.files import MEGABYTE, read_bounded
@@ -84,6 +82,9 @@ def parse_yaml(text: str) -> dict[str, Any]:
     Raises:
         ValueError: with a short reason, whatever is wrong.
     """
+    from omegaconf import OmegaConf  # here: a stop reads JSON, and must not wait for it
+    from omegaconf.errors import OmegaConfBaseException
+
     try:
         _require_moderate(text)
         tree = OmegaConf.to_container(OmegaConf.create(text), resolve=False)

@@ -194,15 +194,20 @@ def _arms() -> Iterator[str]:
     """The latched stop, and which sessions could move arms now."""
     from marl_handover.hardware.latch import StopLatch
     from marl_handover.hardware.roll import Roll
-    from marl_handover.hardware.settings import HardwareConfig
+    from marl_handover.hardware.settings import TWIN, HardwareConfig
 
-    latch = StopLatch(HardwareConfig().stop_path())
+    latch, twins = StopLatch(HardwareConfig().stop_path()), StopLatch(HardwareConfig(name=TWIN).stop_path())
     if latch.is_set():
         yield f"the stop is latched ({latch.reason()}), so nothing moves; allow motion again: marl-handover stop clear=true"
     else:
         yield "no stop is latched"
+    if twins.is_set():
+        yield f"the twin's stop is latched ({twins.reason()}); allow motion again: marl-handover stop clear=true"
     running = Roll().signed()
     yield f"sessions that run: {', '.join(f'process {session.pid}' for session in running) or 'none'}"
+    for session in Roll().others():
+        certain = "runs one" if session.stop_file else "may run one"
+        yield f"{session.owner} {certain} too, process {session.pid}: only {session.owner} can stop it"
 
 
 def _group(path: Path) -> str:

@@ -6,15 +6,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from marl_handover.commands.stop_now import REASON, Ordered, order
 from marl_handover.config import bounded, check_bounds
 from marl_handover.errors import InvalidSetting, WorkFailed
-from marl_handover.hardware.settings import HardwareConfig
-
-if TYPE_CHECKING:
-    from marl_handover.hardware.latch import StopLatch
-    from marl_handover.hardware.roll import Roll, Signed
+from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.roll import Roll, Signed, suspended
+from marl_handover.hardware.settings import TWIN, HardwareConfig
 
 _POLL_S = 0.01
 POWER = "if arms move, CUT THE POWER"
@@ -31,7 +29,7 @@ class NotStopped(WorkFailed):
 class StopCommand:
     """Keys of ``stop``."""
 
-    reason: str = "marl-handover stop"  # is shown by whoever is stopped
+    reason: str = REASON  # is shown by whoever is stopped
     clear: bool = False  # allow motion again; nothing moves by itself
     wait_s: float = bounded(1.0, 0.0, 3600.0)  # for every session to say that it has stopped
     hardware: HardwareConfig = field(default_factory=HardwareConfig)  # with a stop_file: stop only what looks at that one
@@ -42,58 +40,69 @@ ALIASES: dict[str, str] = {}
 GROUPS: dict[str, dict[str, type]] = {}
 
 
-def run(config: StopCommand) -> int:
-    """Latch the stop, or clear it. 0 if every session that runs has stopped, also if there is none: the stop holds for those to come.
+def run(config: StopCommand, ordered: Ordered | None = None) -> int:
+    """Latch the stop, unless it was ``ordered`` already, or clear it.
+
+    0 if every session that runs has stopped, also if there is none: the stop holds for those to come.
 
     Raises:
-        NotStopped: a session did not answer in time, or a stop file cannot be written.
+        NotStopped: a session did not answer in time, another user's was not reached, or a stop file cannot be written.
+        NotCleared: a stop file cannot be taken away.
     """
-    from marl_handover.hardware.latch import StopLatch
-    from marl_handover.hardware.roll import Roll
-
     check_bounds(config)
-    given, roll = config.hardware.stop_file, Roll()
+    given = config.hardware.stop_file
     path = Path(config.hardware.stop_path())
     if given and not path.is_absolute():
         raise InvalidSetting("hardware.stop_file", given, "an absolute path")
-    running = roll.signed(path if given else None)
-    paths = list(dict.fromkeys([path, *(session.stop_file for session in running)]))
     if config.clear:
-        for each in paths:
-            StopLatch(each).clear()
-            print(f"cleared {each}; arms may move again")
-        return 0
-    troubles = [trouble for each in paths if (trouble := _latched(StopLatch(each), config.reason))]
-    troubles += _wait(roll, running, config.wait_s)
+        return _clear([path] if given else [path, Path(HardwareConfig(name=TWIN).stop_path())], only=bool(given))
+    done = ordered or order(path, config.reason, only=bool(given))
+    troubles = [*done.troubles, *_wait(done.waiting, config.wait_s), *(_beyond(session) for session in done.beyond)]
     if troubles:
         raise NotStopped(troubles)
-    if not running:
+    if not done.waiting:
         print(f"no session runs; {POWER}")
     print("allow motion again: marl-handover stop clear=true")
     return 0
 
 
-def _latched(latch: StopLatch, reason: str) -> str:
-    """Latch; what went wrong, empty if nothing did."""
-    try:
-        latch.latch(reason)
-    except OSError as error:
-        return f"the stop file {latch.path} cannot be written ({error.strerror or error})"
-    print(f"stop latched in {latch.path}", flush=True)
-    return ""
+def _clear(paths: Sequence[Path], only: bool) -> int:
+    running = [] if only else [session.stop_file for session in Roll().signed() if session.stop_file]
+    for each in dict.fromkeys([*paths, *running]):
+        StopLatch(each).clear()
+        print(f"cleared {each}; arms may move again")
+    return 0
 
 
-def _wait(roll: Roll, running: Sequence[Signed], wait_s: float) -> list[str]:
+def _wait(running: Sequence[Signed], wait_s: float) -> list[str]:
     """Wait until all have obeyed or signed off; what is wrong with those that have not."""
-    waiting = {session.entry: session.pid for session in running}
+    roll, waiting = Roll(), {session.entry: session for session in running}
     end_s = time.monotonic() + wait_s
     while True:
-        now = {session.entry: session.obeyed for session in roll.signed()}
+        now = {session.entry: session.obeyed for session in [*roll.signed(), *roll.others()]} if waiting else {}
         for entry in [entry for entry in waiting if now.get(entry, True)]:
             what = "has stopped its arms" if entry in now else "is over"
-            print(f"process {waiting.pop(entry)} {what}", flush=True)
+            print(f"{_called(waiting.pop(entry))} {what}", flush=True)
         if not waiting:
             return []
         if time.monotonic() >= end_s:
-            return [f"process {pid} did not answer within {wait_s:g} s" for pid in waiting.values()]
+            return [f"{_called(session)} did not answer within {wait_s:g} s{_held(session.pid)}" for session in waiting.values()]
         time.sleep(_POLL_S)
+
+
+def _called(session: Signed) -> str:
+    return f"process {session.pid}" + (f" of {session.owner}" if session.owner else "")
+
+
+def _held(pid: int) -> str:
+    """Why a process does not answer, if that shows."""
+    return " (it is suspended: it stops its arms once it goes on)" if suspended(pid) else ""
+
+
+def _beyond(session: Signed) -> str:
+    """Words on a session that this user's stop does not reach."""
+    who = session.owner
+    how = f"only {who} can stop it here: sudo -u {who} marl-handover stop" if " " not in who else f"only {who} can stop it here"
+    if session.stop_file is None:
+        return f"{who} may be running a session (process {session.pid}; {session.entry} cannot be read), and {how}"
+    return f"process {session.pid} of {who} runs a session, and {how}"

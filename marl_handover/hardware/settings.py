@@ -19,6 +19,9 @@ from marl_handover.hardware.roll import user_path
 
 FIRST_MOVES = ("ask", "refuse")
 ON_DISCONNECT = ("hold", "limp", "park")
+TWIN = "twin"
+"""The name of hardware that is emulated, physics and camera included."""
+
 ARMS = ("left", "right")
 """Names of the arms in settings, by arm index."""
 MAX_PARK_DEG_S = 90.0
@@ -149,7 +152,7 @@ class HardwareConfig:
     first_move: str = "ask"  # ask somebody to confirm the parked pose, or refuse to move a board that has no reference
     on_disconnect: str = "hold"  # hold (servos stay on), limp (arms sink), park (drive there, then hold)
     park_deg_s: float = 30.0  # speed on the way to the parked pose
-    stop_file: str = ""  # the latched stop, an absolute path; empty: this user's, /tmp/marl-handover-UID.stop
+    stop_file: str = ""  # the latched stop, an absolute path; empty: this user's, /tmp/marl-handover-UID.stop, or .twin.stop
     log_entries: int = 20_000  # of the log of every byte; older ones are dropped
 
     def validate(self) -> None:
@@ -227,5 +230,8 @@ class HardwareConfig:
         return (*self.arms[arm].channels, self.arms[arm].gripper.channel)
 
     def stop_path(self) -> str:
-        """The file whose presence is the latched stop. The same for every session of a user, wherever it was started."""
-        return self.stop_file or str(user_path(".stop"))
+        """The file whose presence is the latched stop. The same for every session of a user, wherever it was started.
+
+        The twin has one of its own: what stops real arms does not keep it from moving, and the other way round.
+        """
+        return self.stop_file or str(user_path(".twin.stop" if self.name == TWIN else ".stop"))

@@ -20,6 +20,7 @@ from marl_handover.config import MotionConfig
 from marl_handover.envs.backends import Execution
 from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
 from marl_handover.errors import WorkFailed
+from marl_handover.hardware.latch import PrivateStop, StopLatch
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.motion.pick_place import timed_phases
 from marl_handover.motion.trajectory import LOADED_PHASES, Phase, PickPlacePaths
@@ -64,6 +65,7 @@ class HardwareBackend:
         dry_run: do all but the last write. Nothing moves, and the block is taken to be where exact arms would have put it.
         log_path: of the session's log; empty: there is none.
         grippers: take the hands as ``calibrate what=grippers`` found them, if it did; else as the settings say.
+        latch: the stop; the one of the settings unless given.
 
     Raises:
         MissingFile, CorruptFile, CalibrationProblem: it was not calibrated.
@@ -82,8 +84,11 @@ class HardwareBackend:
         dry_run: bool = False,
         log_path: str = "",
         grippers: bool = True,
+        latch: StopLatch | None = None,
     ) -> None:
-        self.lab = lab = open_lab(config, model, motion, confirm=confirm, dry_run=dry_run, log_path=log_path, grippers=grippers)
+        self.lab = lab = open_lab(
+            config, model, motion, confirm=confirm, dry_run=dry_run, log_path=log_path, grippers=grippers, latch=latch
+        )
         self.model, self.motion, self.log = model, motion, lab.log
         self.config, self.clock = lab.config.watch, lab.clock
         self.chart_inset = config.chart_inset
@@ -272,7 +277,7 @@ class HardwareBackend:
 
 
 class TwinBackend(HardwareBackend):
-    """The twin, calibrated.
+    """The twin, calibrated. Unless ``hardware`` names a stop file, no stop of anybody else concerns it, and its own none of theirs.
 
     Args:
         model: the cell.
@@ -291,4 +296,4 @@ class TwinBackend(HardwareBackend):
         if hardware is not None:
             config.hardware = replace(hardware, name=TWIN)
         config.calibration = calibration or ""
-        super().__init__(model, motion, config=config)
+        super().__init__(model, motion, config=config, latch=None if config.hardware.stop_file else PrivateStop())

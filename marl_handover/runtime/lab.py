@@ -96,8 +96,9 @@ def open_lab(
     dry_run: bool = False,
     log_path: str = "",
     grippers: bool = True,
+    latch: StopLatch | None = None,
 ) -> Lab:
-    """A calibrated cell; without ``grippers`` the hands are as the settings say.
+    """A calibrated cell; without ``grippers`` the hands are as the settings say, without ``latch`` it has the stop that they name.
 
     Raises:
         MissingFile, CorruptFile, CalibrationProblem, CalibrationMismatch: ``calibrate`` has to be run first, or again.
@@ -115,9 +116,8 @@ def open_lab(
         if grippers:
             hardware = with_grippers(hardware, folder)
         play = Play(half_bands_rad(half_us, calibrations(hardware, model.arm)), model.arm.lower_rad, model.arm.upper_rad)
-        driver = ArmDriver(
-            hardware, model, motion, clock=plugs.clock, latch=StopLatch(hardware.stop_path()), confirm=plugs.confirm, dry_run=dry_run
-        )
+        stop = latch or StopLatch(hardware.stop_path())
+        driver = ArmDriver(hardware, model, motion, clock=plugs.clock, latch=stop, confirm=plugs.confirm, dry_run=dry_run)
         log = EventLog(plugs.clock.now_s, log_path)
         tracker = Tracker(Detector(seen_by, model.cell.config.block, config.target, config.detector), config.tracker)
         watcher = Watcher(plugs.camera, tracker, plugs.clock, config.watch, log, driver.wait)

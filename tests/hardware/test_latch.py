@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
+import stat
 import subprocess
 import sys
 
 import pytest
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware import latch as latches
+from marl_handover.hardware.latch import NotCleared, PrivateStop, StopLatch
 from marl_handover.hardware.roll import NoRoll, Roll
 from marl_handover.hardware.settings import HardwareConfig
 
@@ -111,5 +114,156 @@ def test_every_session_of_a_user_looks_at_the_same_file(monkeypatch, tmp_path):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     assert HardwareConfig().stop_path() == before
     assert HardwareConfig(stop_file="/srv/stop").stop_path() == "/srv/stop"
+    assert HardwareConfig(name="twin").stop_path() != before, "the twin's is another"
     with pytest.raises(InvalidSetting, match="absolute"):
         HardwareConfig(stop_file="mine").validate()
+
+
+def test_what_somebody_else_put_there_stops_and_is_not_read(tmp_path, monkeypatch):
+    """In /tmp anybody may: a FIFO would be waited for, a large file read, escape codes carried out by a terminal."""
+    latch, uid = StopLatch(tmp_path / "stop"), os.getuid()
+    os.mkfifo(latch.path)
+    assert latch.is_set()
+    assert latch.reason() == "stop file present"
+    latch.path.unlink()
+    latch.path.write_text(json.dumps({"reason": "x" * 100_000}))
+    assert latch.reason() == "stop file present"
+    latch.path.write_text("[" * 50_000)
+    assert latch.reason() == "stop file present"
+    (tmp_path / "real").write_text('{"reason": "mine"}')
+    latch.path.unlink()
+    latch.path.symlink_to(tmp_path / "real")
+    assert latch.reason() == "stop file present"
+    latch.path.unlink()
+    latch.path.symlink_to(tmp_path / "nowhere")
+    assert latch.is_set(), "whatever it leads to"
+    latch.path.unlink()
+    latch.path.write_text('{"reason": "theirs"}')
+    monkeypatch.setattr(os, "getuid", lambda: uid + 1)
+    monkeypatch.setattr(os, "geteuid", lambda: uid + 1)
+    assert latch.reason().startswith("stop file present, put there by ")
+
+
+@pytest.mark.parametrize("reason", ["\x1b[2J\x1b]0;owned\x07", "two\nlines", "\u202egnihton", "x" * 5000, "\x9b31m"])
+def test_no_reason_does_anything_to_a_terminal(tmp_path, reason):
+    latch = StopLatch(tmp_path / "stop")
+    latch.path.write_text(json.dumps({"reason": reason}))
+    assert latch.reason().isprintable()
+    assert len(latch.reason()) <= 200
+    latch.latch(reason)
+    assert latch.reason().isprintable()
+    assert StopLatch(latch.path).reason() == latch.reason()
+
+
+def test_pipes_in_the_way_are_neither_waited_for_nor_written_to(tmp_path):
+    latch = StopLatch(tmp_path / "stop")
+    for name in ("stop", "stop.obeyed"):
+        os.mkfifo(tmp_path / name)
+    latch.obeyed()
+    assert latch.obeyed_by() == os.getpid()
+    (tmp_path / "stop.obeyed").unlink()
+    os.mkfifo(tmp_path / "stop.obeyed")
+    assert latch.obeyed_by() is None
+    latch.latch("now")
+    assert StopLatch(latch.path).reason() == "now"
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    latch.path.unlink()
+    latch.path.symlink_to(victim)
+    latch.latch("again")
+    assert victim.read_text() == "mine"
+
+
+def test_a_stop_that_cannot_be_replaced_is_latched_all_the_same(tmp_path):
+    latch = StopLatch(tmp_path / "stop")
+    latch.path.mkdir()
+    (latch.path / "full").write_text("")
+    latch.latch("now")
+    assert StopLatch(latch.path).is_set()
+    with pytest.raises(NotCleared, match="whoever put it there, or root"):
+        latch.clear()
+    assert latch.is_set()
+
+
+def test_a_roll_that_somebody_else_laid_out_is_not_used(tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "roll").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(NoRoll, match="not a folder"):
+        Roll(tmp_path / "roll").sign(tmp_path / "stop")
+    roll = Roll(tmp_path / "theirs")
+    roll.folder.mkdir()
+    os.mkfifo(roll.folder / "1-0.json")
+    uid = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: uid + 1)
+    assert roll.signed() == []
+    with pytest.raises(NoRoll, match="somebody else"):
+        roll.sign(tmp_path / "stop")
+
+
+@pytest.mark.parametrize(
+    "entry", ['{"pid": 0, "stop_file": "/x"}', '{"pid": -1, "stop_file": "/x"}', '{"pid": 1e400}', "[" * 9999, "[]", "7", "x" * 20_000]
+)
+def test_entries_that_are_none_count_for_nothing(tmp_path, entry):
+    roll = Roll(tmp_path / "roll")
+    roll.folder.mkdir()
+    (roll.folder / "1-0.json").write_text(entry)
+    assert roll.signed() == []
+
+
+def test_another_process_with_the_number_of_one_that_was_killed_is_not_taken_for_it(tmp_path):
+    roll = Roll(tmp_path / "roll")
+    entry = roll.sign(tmp_path / "stop")
+    about = json.loads(entry.read_text())
+    entry.write_text(json.dumps(about | {"started": "1"}))
+    assert roll.signed() == []
+
+
+def test_a_process_that_is_over_but_not_yet_buried_is_not_waited_for(tmp_path):
+    roll = Roll(tmp_path / "roll")
+    roll.folder.mkdir()
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+    (roll.folder / "1-0.json").write_text(json.dumps({"pid": process.pid, "stop_file": "/x"}))
+    assert roll.signed() == []
+    process.wait()
+
+
+def test_sessions_of_others_are_seen(tmp_path, monkeypatch):
+    """As whoever has another number sees this user's."""
+    uid = os.getuid()
+    roll = Roll(tmp_path / f"marl-handover-{uid}.sessions")
+    roll.sign(tmp_path / "stop")
+    assert stat.S_IMODE(roll.folder.stat().st_mode) == 0o755
+    (tmp_path / f"marl-handover-{uid + 7}.sessions").mkdir()  # not of whom it says
+    monkeypatch.setattr(os, "getuid", lambda: uid + 1)
+    other = Roll(tmp_path / f"marl-handover-{uid + 1}.sessions")
+    assert [(it.pid, it.stop_file) for it in other.others()] == [(os.getpid(), tmp_path / "stop")]
+    assert other.others()[0].owner
+
+    scan = os.scandir
+
+    def closed(folder):
+        if folder == roll.folder:
+            raise PermissionError(13, "closed")
+        return scan(folder)
+
+    monkeypatch.setattr(os, "scandir", closed)
+    (unknown,) = other.others()
+    assert unknown.stop_file is None
+    assert unknown.pid > 0
+
+
+def test_a_private_stop_concerns_nobody_else(tmp_path, monkeypatch):
+    monkeypatch.setattr(latches, "user_path", lambda suffix: tmp_path / f"user{suffix}")
+    one, two = PrivateStop(), PrivateStop()
+    one.join()
+    assert not one.is_set()
+    one.latch("enough")
+    assert one.reason() == "enough"
+    assert not two.is_set()
+    StopLatch(two.path).latch("a page that shows it")
+    assert two.is_set()
+    two.obeyed()
+    for stop in (one, two):
+        stop.leave()
+    assert list(tmp_path.iterdir()) == []
