@@ -8,8 +8,10 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -247,14 +249,11 @@ sys.exit(cli.main(["stop", *sys.argv[3:]]))
 
 
 @pytest.fixture
-def somebody(tmp_path):
+def somebody():
     """Another user with a process and a roll; ``stop(*arguments, uid=...)`` as a third user, who may read it or not."""
     if os.getuid() != 0:
         pytest.skip("needs root, to be other users")
-    for parent in (tmp_path, *tmp_path.parents[:2]):
-        parent.chmod(0o755)
-    base = tmp_path / "tmp"
-    base.mkdir()
+    base = Path(tempfile.mkdtemp(prefix="marl-test-"))  # pytest's own folders are closed to others
     base.chmod(0o1777)
     process = subprocess.Popen(["python-that-sleeps", "60"], executable=shutil.which("sleep"), user=ELSEWHERE)
     folder = base / f"marl-handover-{ELSEWHERE}.sessions"
@@ -271,6 +270,7 @@ def somebody(tmp_path):
     yield SimpleNamespace(process=process, folder=folder, entry=entry, base=base, stop=stop)
     process.kill()
     process.wait()
+    shutil.rmtree(base)
 
 
 def test_a_session_of_another_user_is_no_success(somebody):
