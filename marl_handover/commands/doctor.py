@@ -132,6 +132,12 @@ def _compiler() -> Iterator[str]:
     if not headers.is_file():
         major, minor = sys.version_info[:2]
         yield f"Python.h       none, so torch.compile cannot be used; run: apt install python{major}.{minor}-dev"
+    try:
+        from marl_handover.compiled import cache_place
+    except ImportError:
+        return
+    place, trouble = cache_place()
+    yield f"kernels        kept in {place}" if place else f"kernels        compiled anew each time: {trouble}; set NUMBA_CACHE_DIR=FOLDER"
 
 
 def _listed(folder: str, pattern: str, otherwise: str) -> Iterator[str]:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from marl_handover.cell import Cell, load_cell
-from marl_handover.config import TaskConfig
+from marl_handover.compose_schema import closest_first
+from marl_handover.config import CellConfig, TaskConfig, require_choice
 from marl_handover.envs.problem_source import ProblemSource
-from marl_handover.errors import NotFinite
+from marl_handover.envs.top_view import TopView
+from marl_handover.errors import InvalidSetting, NotFinite, UnknownKey
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.observations import observation_size, observe
 from marl_handover.task.rules import Outcome, Rules
@@ -22,26 +25,44 @@ from marl_handover.task.rules import Outcome, Rules
 Observation = dict[str, NDArray[np.float32]]
 
 
+LAYOUT, RENDER_MODES = "object", ("rgb_array",)
+
+
 class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
     """One cell.
 
-    ``observation`` is the named layout (``object`` by default: a layout without the goal, since a hindsight buffer swaps only
-    ``desired_goal``); ``achieved_goal`` and ``desired_goal`` are poses in mm, mm, rad. Actions are float32[4] = (final, arm, alpha, beta).
-    ``info`` carries ``feasible``, ``final``, ``transfers``, ``outcome`` and ``is_success``.
+    ``observation`` is the layout ``object``, the one without the goal: a hindsight buffer swaps only ``desired_goal``, and would train
+    on features of the old goal; ``achieved_goal`` and ``desired_goal`` are poses in mm, mm, rad. Actions are float32[4] =
+    (final, arm, alpha, beta). ``info`` carries ``feasible``, ``final``, ``transfers``, ``outcome`` and ``is_success``.
 
     Args:
         architecture: ``"A"`` or ``"B"``; replaces the task's.
-        cell: the cell; the shipped ``paper`` cell if None.
+        cell: the cell, or what :func:`marl_handover.cell.load_cell` takes; the shipped ``paper`` cell if None.
         task: the task's settings; the defaults, with layout ``object``, if None.
+        render_mode: ``"rgb_array"``: :meth:`render` draws the table from above.
+        settings: single settings of the task, such as ``epsilon_deg=1.0``, put over ``task``.
+
+    Raises:
+        UnknownKey, InvalidSetting, UnknownChoice: for settings that cannot be, and for a layout that contains the goal.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # as the base class has it
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 2}  # noqa: RUF012  # as the base class has it
 
-    def __init__(self, architecture: str = "B", cell: Cell | None = None, task: TaskConfig | None = None, render_mode: None = None) -> None:
-        cell = cell or load_cell()
-        task = replace(task or TaskConfig(layout="object"), architecture=architecture)
+    def __init__(
+        self,
+        architecture: str = "B",
+        cell: Cell | CellConfig | str | None = None,
+        task: TaskConfig | None = None,
+        render_mode: str | None = None,
+        **settings: Any,
+    ) -> None:
+        if render_mode is not None:
+            require_choice("render_mode", render_mode, RENDER_MODES)
+        task = _with(task or TaskConfig(layout=LAYOUT), {"architecture": architecture, **settings})
+        cell = cell if isinstance(cell, Cell) else load_cell(cell or CellConfig())
         self.rules = Rules(cell, task, motion_cost(cell, task))
         self.render_mode = render_mode
+        self._view: TopView | None = None
         reach = float(max(abs(base.x_mm) for base in cell.bases) + cell.r_max_mm + 1.0)
         reach_y = float(max(abs(base.y_mm) for base in cell.bases) + cell.r_max_mm + 1.0)
         high = np.array([reach, reach_y, math.pi], dtype=np.float32)
@@ -57,6 +78,22 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         self._previous = np.int64(-1)
         self._transfers = 0
         self._problems = ProblemSource(self.rules.cell)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's description of this environment, which :func:`gymnasium.make` sets; its step limit is the task's."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, given: EnvSpec | None) -> None:
+        self._spec = None if given is None else replace(given, max_episode_steps=self.rules.config.max_steps)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The table from above with the block, and the goal's outline, (height, width, 3); None without a render mode."""
+        if self.render_mode is None:
+            return None
+        self._view = self._view or TopView(self.rules.cell)
+        return self._view.draw(self._pose, self._goal)
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Start an episode. ``options={"state": [x_mm, y_mm, theta_rad], "goal": [...]}`` sets the problem, else it is random.
@@ -160,3 +197,18 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
             "outcome": outcome.name.lower(),
             "is_success": outcome is Outcome.SUCCESS,
         }
+
+
+def _with(task: TaskConfig, settings: Mapping[str, Any]) -> TaskConfig:
+    """``task`` with single settings changed, checked."""
+    names = [item.name for item in fields(TaskConfig)]
+    for name in settings:
+        if name not in names:
+            raise UnknownKey(name, closest_first(name, names))
+    task = replace(task, **settings)
+    task.validate()
+    if task.layout != LAYOUT:
+        raise InvalidSetting(
+            "layout", task.layout, f"{LAYOUT!r} here: others contain the goal, which hindsight replaces in desired_goal only"
+        )
+    return task

@@ -18,8 +18,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from marl_handover.compiled import compiled
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -27,7 +28,7 @@ Ints = NDArray[np.int64]
 FAR_MM = 1e9
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def forward_kinematics(planar: Floats, Q: Floats, i: int, frames: Floats, slot: int) -> None:
     """Fill ``frames[slot]`` (5, 4): each level's pivot (r, z) and (cos, sin) of its pitch; Q[i] = (yaw, shoulder, elbow, wrist pitch)."""
     for level in range(2):
@@ -42,14 +43,14 @@ def forward_kinematics(planar: Floats, Q: Floats, i: int, frames: Floats, slot: 
         r, z = r + c * x - s * y, z + s * x + c * y
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def at_wrist(frames: Floats, i: int, x: float, z: float) -> tuple[float, float]:
     """A point (x, z) of the wrist's frame as (r, z) in mm, at sample ``i``."""
     c, s = frames[i, 4, 2], frames[i, 4, 3]
     return frames[i, 4, 0] + c * x - s * z, frames[i, 4, 1] + s * x + c * z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def elbow_up(planar: Floats, r: Floats, z: Floats, pitch: Floats, out: Floats) -> None:
     """Fill ``out`` (n, 3) with shoulder, elbow and wrist pitch of the elbow-up arm whose grip is at (r, z) mm; NaN out of reach.
 
@@ -71,7 +72,7 @@ def elbow_up(planar: Floats, r: Floats, z: Floats, pitch: Floats, out: Floats) -
         out[i, 2] = pitch[i] - out[i, 0] - out[i, 1]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def place_capsules(capsules: Floats, frames: Floats, i: int, ends: Floats) -> None:
     """Fill ``ends`` (K, 10): both end points (r, t, z), then the midpoint and half the length."""
     for k in range(capsules.shape[0]):
@@ -87,7 +88,7 @@ def place_capsules(capsules: Floats, frames: Floats, i: int, ends: Floats) -> No
         ends[k, 9] = capsules[k, 8]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def into_arm_plane(obstacles: Floats, row: int, cos_yaw: float, sin_yaw: float, out: Floats, slot: int) -> None:
     """Put an obstacle into the planar frame: row ``slot`` of ``out`` (., 10), as :func:`place_capsules` does."""
     for e in range(2):
@@ -100,7 +101,7 @@ def into_arm_plane(obstacles: Floats, row: int, cos_yaw: float, sin_yaw: float, 
     out[slot, 9] = obstacles[row, 8]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def hand_ball(planar: Floats, frames: Floats, i: int, out: Floats, slot: int) -> None:
     """Put the ball around wrist, hand and what they hold into row ``slot`` of ``out``, as a segment without length, its radius left out."""
     r, z = at_wrist(frames, i, planar[11], planar[12])
@@ -109,7 +110,7 @@ def hand_ball(planar: Floats, frames: Floats, i: int, out: Floats, slot: int) ->
     out[slot, 9] = 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def hand_is_away(planar: Floats, frames: Floats, i: int, need: float) -> bool:
     """Whether wrist, hand and what they hold are surely farther than ``need`` from base and turret."""
     r, z = at_wrist(frames, i, planar[11], planar[12])
@@ -118,7 +119,7 @@ def hand_is_away(planar: Floats, frames: Floats, i: int, need: float) -> bool:
     return dr * dr + dz * dz > away * away
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def broad_phase(A: Floats, a: int, B: Floats, b: int, limit: float) -> bool:
     """Whether two placed segments, rows of ``A`` and ``B``, are surely farther apart than ``limit``: it spares most distances."""
     dx, dy, dz = A[a, 6] - B[b, 6], A[a, 7] - B[b, 7], A[a, 8] - B[b, 8]
@@ -126,7 +127,7 @@ def broad_phase(A: Floats, a: int, B: Floats, b: int, limit: float) -> bool:
     return away < 0.0 or dx * dx + dy * dy + dz * dz > away * away
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def closest_points(A: Floats, a: int, B: Floats, b: int, out: Floats) -> float:
     """Distance of two placed segments; ``out`` (6,): the nearest point of the first, then the unit vector from the second's to it.
 
@@ -155,7 +156,7 @@ def closest_points(A: Floats, a: int, B: Floats, b: int, out: Floats) -> float:
     return distance
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def jacobian_transpose(
     frames: Floats, i: int, level: int, r: float, t: float, z: float, nr: float, nt: float, nz: float, weight: float, grad: Floats
 ) -> None:
@@ -166,7 +167,7 @@ def jacobian_transpose(
         grad[i, joint - 1] += weight * (nz * (r - frames[i, joint, 0]) - nr * (z - frames[i, joint, 1]))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def world_shapes(joints: Floats, planar: Floats, capsules: Floats, x: float, y: float, facing: float) -> Floats:
     """Placed segments (S, K, 11) of joint samples (S, 4), in the frame the arm's base stands in at (x, y) and faces; radius last."""
     S, K = joints.shape[0], capsules.shape[0]
@@ -183,7 +184,7 @@ def world_shapes(joints: Floats, planar: Floats, capsules: Floats, x: float, y: 
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def can_meet(planar: Floats, capsules: Floats, a: int, b: int, need: float, limits: Floats, steps: Ints) -> bool:
     """Whether capsules ``a`` and ``b`` of one arm might come nearer than ``need`` within the joint ``limits`` (4, 2).
 

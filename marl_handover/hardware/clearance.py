@@ -9,10 +9,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
+from marl_handover.compiled import compiled
 from marl_handover.geometry.capsules import capsule_pairs, joints_before
 from marl_handover.geometry.kernels import FAR_MM, broad_phase, closest_points
 from marl_handover.geometry.urdf import ARM_JOINTS
@@ -47,7 +47,7 @@ def arm_shapes(model: CellModel) -> Shapes:
     return Shapes(pivots, np.array(rows, float), np.stack([first, second], axis=1).astype(np.int64))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def place(q: Floats, shapes: Shapes, x: float, y: float, facing: float, out: Floats) -> None:
     """Fill ``out`` (K, 10) with the placed segments, rows as in the planner's kernels, of an arm at joints ``q`` (5,), base at (x, y)."""
     pivots, capsules = shapes.pivots, shapes.capsules
@@ -82,7 +82,7 @@ def place(q: Floats, shapes: Shapes, x: float, y: float, facing: float, out: Flo
         out[k, 9] = 0.5 * math.sqrt(square)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def alone_mm(Q: Floats, shapes: Shapes, out: Floats) -> None:
     """Fill ``out`` (2,): smallest height over the table of the links after the turret, and smallest distance of the arm to itself.
 
@@ -103,7 +103,7 @@ def alone_mm(Q: Floats, shapes: Shapes, out: Floats) -> None:
                 out[1] = min(out[1], closest_points(placed, a, placed, b, point) - need)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def between_mm(Q: Floats, others: Floats, together: bool, shapes: Shapes, base: Floats, other_base: Floats) -> float:
     """Smallest distance of two arms over their joint samples ``Q`` (S, 5) and ``others`` (N, 5); bases are (x, y, facing).
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from marl_handover.compiled import compiled
 from marl_handover.motion.collision_model import Scene
 from marl_handover.motion.objective import LEVER_MM, Penalty, columns, lagrangian
 
@@ -57,7 +57,7 @@ class Evaluation(NamedTuple):
     values: Floats
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def minimize(points: Floats, spline: Spline, scene: Scene, weights: Floats, options: SolverOptions) -> tuple[Floats, float, int]:
     """Improve control points (N, 4), ends fixed.
 
@@ -81,7 +81,7 @@ def minimize(points: Floats, spline: Spline, scene: Scene, weights: Floats, opti
     return x, worst, evaluations
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _minimise(
     x: Floats,
     rho: float,
@@ -125,7 +125,7 @@ def _minimise(
     return x, f, evaluations
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _update(H: Floats, s: Floats, y: Floats) -> None:
     """The BFGS update of an inverse Hessian, in place; left out where the curvature is not positive."""
     sy = np.dot(s, y)
@@ -138,7 +138,7 @@ def _update(H: Floats, s: Floats, y: Floats) -> None:
             H[a, b] += factor * s[a] * s[b] - (Hy[a] * s[b] + s[a] * Hy[b]) / sy
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _evaluate(
     x: Floats, rho: float, held: Multipliers, now: Evaluation, spline: Spline, scene: Scene, weights: Floats
 ) -> tuple[float, Floats]:
@@ -168,7 +168,7 @@ def _evaluate(
     return f, g.reshape(4 * n)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _times(H: Floats, v: Floats) -> Floats:
     """The product of a symmetric matrix with a vector."""
     out = np.zeros(len(v))
@@ -178,7 +178,7 @@ def _times(H: Floats, v: Floats) -> Floats:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _update_multipliers(x: Floats, values: Floats, held: Multipliers, rho: float, limits: Floats) -> tuple[float, float]:
     """Take over the multipliers; the greatest violation in mm, and what the penalty was."""
     worst, paid, lam, limit = 0.0, 0.0, held.lam, held.limit

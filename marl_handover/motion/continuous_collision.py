@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from marl_handover.compiled import compiled
 from marl_handover.motion.collision_model import Scene
 from marl_handover.motion.path_optimizer import Segment
 from marl_handover.motion.splines import knots
@@ -50,7 +50,7 @@ def certify(segment: Segment, points: Floats, degree: int) -> Certificate:
     return Certificate(float(margin), bool(margin >= 0.0), int(looks))
 
 
-@njit(cache=True, nogil=True)
+@compiled(error_model="python")
 def _prove(points: Floats, degree: int, vector: Floats, inner: Floats, speeds: Floats, scene: Scene) -> tuple[float, int]:
     """The least proved margin over all spans, and the postures looked at."""
     least, looks, out, q = np.inf, 0, np.empty(6), np.empty((1, 4))
@@ -78,7 +78,7 @@ def _prove(points: Floats, degree: int, vector: Floats, inner: Floats, speeds: F
     return least, looks
 
 
-@njit(cache=True, nogil=True)
+@compiled(error_model="python")
 def _at(points: Floats, degree: int, vector: Floats, span: int, tau: float, out: Floats) -> None:
     """De Boor's algorithm: the path at ``tau`` of knot span ``span`` into ``out`` (1, 4)."""
     work = points[span - degree : span + 1].copy()

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from marl_handover.compiled import compiled
 from marl_handover.geometry.kernels import FAR_MM, broad_phase, closest_points, world_shapes
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import LOADED_PHASES, Phase, TransferMotion
@@ -117,7 +117,7 @@ def _end_of(phases: Sequence[Phase], name: str) -> float:
     return float(next(phase for phase in phases if phase.name == name).t_s[-1] - phases[0].t_s[0])
 
 
-@njit(cache=True, nogil=True)
+@compiled(error_model="python")
 def _clearances(first: Floats, counts: NDArray[np.int64], second: Floats, others: NDArray[np.int64]) -> Floats:
     out, point = np.empty((first.shape[0], second.shape[0])), np.empty(6)
     for i in range(first.shape[0]):

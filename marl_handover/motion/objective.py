@@ -15,9 +15,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from marl_handover.compiled import compiled
 from marl_handover.geometry.kernels import (
     FAR_MM,
     at_wrist,
@@ -50,13 +50,13 @@ class Penalty(NamedTuple):
     weights: Floats
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def columns(scene: Scene) -> int:
     """How many constraints a sample has."""
     return 2 * scene.capsules.shape[0] + scene.pairs.shape[0] + 1 + scene.edges.shape[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def first_moving(capsules: Floats) -> int:
     """Index of the first capsule that is neither base nor turret."""
     first = 0
@@ -65,7 +65,7 @@ def first_moving(capsules: Floats) -> int:
     return first
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def ramp(x: float, y: float, profile: Floats, out: Floats) -> None:
     """The lift-over ramp at (x, y): ``out`` (3,) its value 0..1 and its gradient.
 
@@ -85,7 +85,7 @@ def ramp(x: float, y: float, profile: Floats, out: Floats) -> None:
     out[0], out[1], out[2] = value, gx, gy
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def lagrangian(Q: Floats, scene: Scene, penalties: Penalty, grad: Floats, values: Floats) -> float:
     """Cost + penalty of joint samples ``Q`` (S, 4); fills ``grad`` (S, 4) and the constraints ``values`` (S, C) (-FAR_MM: inactive)."""
     # Out of the tuples once: each look into one costs a reference count, here and in every function it is handed to.
@@ -126,13 +126,13 @@ def lagrangian(Q: Floats, scene: Scene, penalties: Penalty, grad: Floats, values
     return penalty + _length(Q, planar, penalties.step, penalties.weights, frames, grip, grad)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _charge(held: float, rho: float, over: float) -> float:
     """The force h = max(0, lambda + rho c) of a constraint; its penalty is h^2 / (2 rho)."""
     return max(0.0, held + rho * over)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _obstacles(
     i: int, cy: float, sy: float, first: int, capsules: Floats, obstacles: Floats, group: Floats, lam: Floats, rho: float, frames: Floats,
     ends: Floats, worst: Floats, contact: Floats, placed: Floats, point: Floats, close: Ints, grad: Floats, values: Floats,
@@ -174,7 +174,7 @@ def _obstacles(
     return penalty
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _itself(
     i: int, grouped: int, planar: Floats, capsules: Floats, pairs: Ints, clearance: float, lam: Floats, rho: float, frames: Floats,
     ends: Floats, point: Floats, grad: Floats, values: Floats,
@@ -203,7 +203,7 @@ def _itself(
     return penalty
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _table(
     i: int, first: int, carried: int, P: int, capsules: Floats, clearance: float, lam: Floats, rho: float, frames: Floats, ends: Floats,
     grad: Floats, values: Floats,
@@ -221,7 +221,7 @@ def _table(
     return penalty
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _height(
     i: int, column: int, pr: float, pz: float, r: float, z: float, demanded: float, rise: float, sr: float, st: float, lam: Floats,
     rho: float, frames: Floats, grad: Floats, values: Floats,
@@ -236,7 +236,7 @@ def _height(
     return 0.5 * h * h / rho
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _length(Q: Floats, planar: Floats, step: Floats, weights: Floats, frames: Floats, grip: Floats, grad: Floats) -> float:
     """Length of the grip's path, with a little for uneven speed and for joint motion; adds its gradient to ``grad``."""
     samples = Q.shape[0]

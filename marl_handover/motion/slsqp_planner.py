@@ -16,10 +16,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from marl_handover.compiled import compiled
 from marl_handover.geometry.closed_form import grip_in_plane, grip_speed
 from marl_handover.geometry.kernels import elbow_up
 from marl_handover.motion.collision_model import Scene
@@ -107,7 +107,7 @@ def first_guess(segment: Segment) -> Floats:
     return np.concatenate([line[:, :1], inner, np.zeros((CONTROL_POINTS, 1))], axis=1)
 
 
-@njit(cache=True, nogil=True)
+@compiled(error_model="python")
 def sample_margins(Q: Floats, scene: Scene, out: Floats) -> None:
     """Fill ``out`` (S, 6) with the fields of :class:`~marl_handover.motion.validation.Margins` of each joint sample of ``Q`` (S, 4)."""
     for i in range(Q.shape[0]):

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from marl_handover.compiled import compiled
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -26,7 +27,7 @@ _NEVER = 1e300  # half the width of a strip that does not bind
 _SETTLED = 1.003  # an excess over the limits that is not worth another pass
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def spline(points: Floats, knots: Floats, degree: int, tau: Floats) -> Floats:
     """The spline (n, joints) at ``tau`` (n,), ascending, by the recursion of Cox and de Boor."""
     joints = points.shape[1]
@@ -52,7 +53,7 @@ def spline(points: Floats, knots: Floats, degree: int, tau: Floats) -> Floats:
     return values
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def dot(a: Floats, i: int, b: Floats, j: int) -> float:
     """The product of row i of ``a`` and row j of ``b``."""
     total = 0.0
@@ -61,7 +62,7 @@ def dot(a: Floats, i: int, b: Floats, j: int) -> float:
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def turns(tau: Floats, first: Floats) -> Floats:
     """About where the path turns by more than a right angle from one ``tau`` (n,) to the next; ``first`` (n, joints) is dq/dtau.
 
@@ -86,7 +87,7 @@ def turns(tau: Floats, first: Floats) -> Floats:
     return found[:count]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def still_spans(first_points: Floats, knots: Floats, degree: int) -> Floats:
     """The inner ends of those spans between knots on which the path stands still."""
     most = 0.0
@@ -104,7 +105,7 @@ def still_spans(first_points: Floats, knots: Floats, degree: int) -> Floats:
     return found[:count]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _parameter_rates(nodes: Floats, first: Floats, second: Floats) -> Floats:
     """ds/dtau (n, 3) at the beginning, middle and end of each interval, from dq/dtau and d2q/dtau2 (2n + 1, joints) there.
 
@@ -136,7 +137,7 @@ def _parameter_rates(nodes: Floats, first: Floats, second: Floats) -> Floats:
     return rates
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _within(rates: Floats, i: int, z: float) -> tuple[float, float, float]:
     """At the part ``z`` of interval i, as if its width were 1: s from its beginning, ds/dz and d2s/dz2."""
     start = rates[i, 0]
@@ -145,7 +146,7 @@ def _within(rates: Floats, i: int, z: float) -> tuple[float, float, float]:
     return ((curve / 3.0 * z + 0.5 * bend) * z + start) * z, (curve * z + bend) * z + start, 2.0 * curve * z + bend
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _bounds(
     nodes: Floats, rates: Floats, first: Floats, second: Floats, velocity: Floats, most: Floats, slope: Floats, half: Floats
 ) -> None:
@@ -183,7 +184,7 @@ def _bounds(
                     slope[i, row], half[i, row] = of_x / of_y, 1.0 / of_y
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _greatest_start(slope: Floats, half: Floats, i: int, x: float, y_most: float, sum_most: float) -> float:
     """The greatest start value of interval i, at most ``x``, with a y in all strips, at most ``y_most`` and ``sum_most`` less the start.
 
@@ -212,7 +213,7 @@ def _greatest_start(slope: Floats, half: Floats, i: int, x: float, y_most: float
     return x
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _squared_speeds(stops: Bools, most: Floats, slope: Floats, half: Floats) -> Floats:
     """The greatest x at each grid point (n + 1,), 0 at ``stops`` (n + 1,) and at both ends."""
     n = slope.shape[0]
@@ -228,7 +229,7 @@ def _squared_speeds(stops: Bools, most: Floats, slope: Floats, half: Floats) -> 
     return x
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _excess(nodes: Floats, rates: Floats, squares: Floats, first: Floats, second: Floats, velocity: Floats, excess: Floats) -> float:
     """The greatest acceleration, or square of a speed, relative to its limit, at the quarters of the intervals; at least 1.
 
@@ -252,7 +253,7 @@ def _excess(nodes: Floats, rates: Floats, squares: Floats, first: Floats, second
     return worst
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def fastest(
     nodes: Floats, stops: Bools, rounds: int, first_points: Floats, second_points: Floats, knots: Floats, degree: int, velocity: Floats
 ) -> tuple[Floats, Floats, Floats]:
@@ -296,7 +297,7 @@ def fastest(
     return rates, squares, times
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def time_law(nodes: Floats, rates: Floats, squares: Floats, times: Floats, t: Floats) -> tuple[Floats, Floats]:
     """The tau and dtau/dt (m,) at times ``t`` (m,), ascending."""
     tau = np.empty(t.shape[0])

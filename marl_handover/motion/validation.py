@@ -6,9 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from marl_handover.compiled import compiled
 from marl_handover.geometry.kernels import (
     FAR_MM,
     at_wrist,
@@ -54,7 +54,7 @@ class Margins(NamedTuple):
         return min(self.arm, self.block, self.itself, self.ground, self.lift + ROUNDING_MM, self.edge + ROUNDING_MM)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def dense_margins(Q: Floats, scene: Scene, out: Floats) -> float:
     """Fill ``out`` (6,) with the fields of :class:`Margins` over the joint samples ``Q`` (S, 4); the grip's path length in mm.
 
@@ -90,7 +90,7 @@ def dense_margins(Q: Floats, scene: Scene, out: Floats) -> float:
     return length
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _around(
     cy: float, sy: float, first: int, hand: int, planar: Floats, capsules: Floats, obstacles: Floats, arm_rows: int, frames: Floats,
     ends: Floats, placed: Floats, point: Floats, out: Floats,
@@ -107,7 +107,7 @@ def _around(
                 out[field] = min(out[field], closest_points(ends, k, placed, 0, point) - need)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _itself(
     first: int, carried: int, planar: Floats, capsules: Floats, pairs: Ints, clearance: Floats, frames: Floats, ends: Floats,
     point: Floats, out: Floats,

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 import marl_handover
 from marl_handover.config import NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.envs import SupervisorEnv, SupervisorGoalEnv
-from marl_handover.errors import NotFinite, OutOfReach
+from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, UnknownKey
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.rules import Outcome
 
@@ -62,12 +62,52 @@ def test_importing_the_package_registers_both():
 
 
 @architectures
-@pytest.mark.parametrize("layout", ["raw", "relative", "object"])
-def test_observations_are_in_their_space(architecture, layout):
-    env = SupervisorGoalEnv(architecture, task=TaskConfig(layout=layout, noise=NoiseConfig(5.0, 3.0)))
+def test_observations_are_in_their_space(architecture):
+    env = SupervisorGoalEnv(architecture, task=TaskConfig(layout="object", noise=NoiseConfig(5.0, 3.0)))
     for before, _, after, *_ in walk(env, 300):
         assert env.observation_space.contains(before)
         assert env.observation_space.contains(after)
+
+
+@pytest.mark.parametrize("layout", ["raw", "relative"])
+def test_a_layout_with_the_goal_in_it_is_refused(layout):
+    with pytest.raises(InvalidSetting, match="contain the goal"):
+        SupervisorGoalEnv("B", task=TaskConfig(layout=layout))
+    with pytest.raises(InvalidSetting, match="contain the goal"):
+        made("B", layout=layout)
+
+
+def test_single_settings_of_the_task_can_be_given_to_make():
+    env = made("A", epsilon_deg=1.0, max_steps=7, cell="al5a", noise=NoiseConfig(1.0))
+    config = env.unwrapped.rules.config
+    assert (config.epsilon_deg, config.max_steps, config.architecture, config.layout) == (1.0, 7, "A", "object")
+    assert env.unwrapped.rules.cell.config.name == "al5a"
+    assert env.unwrapped.rules.noisy
+    with pytest.raises(UnknownKey, match="epsilon_deg"):
+        made(epsilon=1.0)
+    with pytest.raises(InvalidSetting, match="epsilon_deg = -1"):
+        made(epsilon_deg=-1)
+
+
+def test_the_step_limit_is_in_the_specification_and_no_wrapper_cuts_it():
+    assert made().spec.max_episode_steps == TaskConfig().max_steps
+    env = made(max_steps=40)
+    assert env.spec.max_episode_steps == 40
+    env.reset(options={"state": EASY["state"], "goal": [-200.0, -180.0, 3.0]})
+    ends = [env.step(np.array([-1, 1, 0, 0], np.float32))[3] for _ in range(40)]  # the right arm puts it down where it lies, ever again
+    assert ends == [False] * 39 + [True]
+
+
+def test_pictures_or_a_refusal_when_it_is_made():
+    env = made(render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    env.reset(seed=1)
+    assert first.dtype == np.uint8
+    assert first.shape[2] == 3
+    assert (first != env.render()).any()
+    with pytest.raises(UnknownChoice, match="rgb_array"):
+        SupervisorGoalEnv(render_mode="human")
 
 
 def test_the_observation_has_no_goal():
