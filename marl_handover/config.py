@@ -71,7 +71,7 @@ EPSILON_DEG, MAX_STEPS, SYMMETRY_ORDER, TOLERANCE_MM = (1e-4, 180.0), (1, 1000),
 class BlockConfig:
     """The object: a square block with an upright pin in its centre, by which it is held."""
 
-    side_mm: float = bounded(40.0, 5.0, 200.0)
+    side_mm: float = bounded(40.0, 5.0, 300.0)
     height_mm: float = bounded(15.0, 2.0, 200.0)
     pin_diameter_mm: float = bounded(2.5, 0.5, 20.0)
     pin_top_mm: float = bounded(65.0, 5.0, 400.0)

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-LONGEST_VALUE, LONGEST_LIST, LONGEST_REASON = 60, 160, 220
+LONGEST_VALUE, LONGEST_LIST, LONGEST_REASON = 120, 160, 220
 """Characters of a value, of a list of choices and of a reason in a message."""
 
 
