@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from marl_handover.errors import BadOverride, HandoverError, shortened, shown
+from marl_handover.errors import BadOverride, HandoverError, exit_status_of, shortened, shown
 
 PROGRAM = "marl-handover"
 LONGEST_LINE = 300
@@ -100,11 +100,22 @@ def _guarded(name: str, arguments: list[str]) -> int:
     except OSError as error:
         if debug:
             raise
-        return _fail(speaker, f"cannot read or write {error.filename or 'a file'}: {error.strerror or error}", EXIT_BAD_INPUT)
+        name = error.filename or ("standard output" if _output_lost() else "a file")
+        return _fail(speaker, f"cannot read or write {name}: {error.strerror or error}", exit_status_of(error))
     except Exception as error:
         if debug:
             raise
         return _fail(speaker, f"internal error: {type(error).__name__}: {error}; run again with debug=true to see where", EXIT_FAILED)
+
+
+def _output_lost() -> bool:
+    """Whether what was printed cannot be written; then nothing more is tried, as the interpreter would on its way out."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 def _dispatch(name: str, arguments: list[str]) -> int:

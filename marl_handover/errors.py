@@ -187,6 +187,14 @@ class MissingExtra(HandoverError):
         self.setting, self.package, self.extra = setting, package, extra
 
 
+class MissingProgram(WorkFailed):
+    """Something needs a program that is not on this machine."""
+
+    def __init__(self, what: str, program: str, fix: str) -> None:
+        super().__init__(f"{what} needs the program {program}, which is not here; {fix}")
+        self.what, self.program, self.fix = what, program, fix
+
+
 def first_line(error: BaseException) -> str:
     """First line of what an error says, or its kind if it says nothing."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -15,8 +15,8 @@ import sys
 import tempfile
 import time
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
@@ -37,7 +37,8 @@ KINDS = {
     stat.S_IFSOCK: "a socket",
 }
 
-_TEMPORARY = re.compile(r"\.\d+-[0-9a-f]{8}\.tmp(\.\w+)?$")
+_TEMPORARY = re.compile(r"(\.\d+(-[0-9a-f]{8})?|^checkpoint\.pt)\.tmp(\.\w+)?$")
+"""Names that :func:`temporary_of` gives, and those that version 0.1 gave."""
 
 
 def expanded(text: str | Path) -> Path:
@@ -228,6 +229,21 @@ def write_whole(path: Path, content: str | bytes, durable: bool = True) -> None:
         stream.write(content.encode() if isinstance(content, str) else content)
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder, and those above it, if it is not there. Raises :class:`CannotWrite`."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CannotWrite(path, error) from error
+
+
+def write_together(contents: Mapping[Path, str]) -> None:
+    """Write files that are wrong without each other: all have room before the first is replaced. Raises :class:`CannotWrite`."""
+    with ExitStack() as stack:
+        for path, text in contents.items():
+            stack.enter_context(replacing(path)).write_text(text, encoding="utf-8")
+
+
 def copy_whole(source: Path, path: Path) -> None:
     """Copy a file, with its times, as :func:`replacing` does. Raises :class:`CannotWrite`."""
     with replacing(path) as temporary:
@@ -333,6 +349,13 @@ class GrowingFile:
                     os.ftruncate(self._descriptor, size)
             raise CannotWrite(self.path, error) from error
 
+    def to_disk(self) -> None:
+        """See that what was written outlives a loss of power. Raises :class:`CannotWrite`."""
+        try:
+            os.fsync(self._descriptor)
+        except OSError as error:
+            raise CannotWrite(self.path, error) from error
+
     def close(self) -> None:
         """Close the file; again is fine."""
         if self._descriptor >= 0:
@@ -340,7 +363,7 @@ class GrowingFile:
         self._descriptor = -1
 
 
-def read_lines(path: Path, limit_bytes: int, what: str, parse: Callable[[bytes], Parsed]) -> list[tuple[int, Parsed]]:
+def read_lines(path: Path, limit_bytes: int, what: str, parse: Callable[[bytes], Parsed]) -> Iterator[tuple[int, Parsed]]:
     """The lines of a file that grows, each with its number from 1; empty ones are left out.
 
     A last line without an end that ``parse`` cannot read was cut off, by a full disk or a killed process: it is left out, and a warning
@@ -351,18 +374,18 @@ def read_lines(path: Path, limit_bytes: int, what: str, parse: Callable[[bytes],
     Raises:
         CorruptFile: ``parse`` cannot read another line.
     """
-    lines = read_bounded(path, limit_bytes, what).split(b"\n")
-    rows = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        try:
-            rows.append((number, parse(line)))
-        except ValueError as error:
-            if number < len(lines):
-                raise CorruptFile(what, path, f"line {number} {error}") from error
-            LOG.warning("%s %s was cut off in line %d; the %d lines before it are read", what, path, number, number - 1)
-    return rows
+    with open_bounded(path, limit_bytes, what) as stream:
+        for number, line in enumerate(stream, start=1):
+            if not line.strip():
+                continue
+            try:
+                parsed = parse(line)
+            except ValueError as error:
+                if line.endswith(b"\n"):
+                    raise CorruptFile(what, path, f"line {number} {error}") from error
+                LOG.warning("%s %s was cut off in line %d; the %d lines before it are read", what, path, number, number - 1)
+                return
+            yield number, parsed
 
 
 def keep(path: Path) -> Path | None:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from marl_handover.errors import CorruptFile
-from marl_handover.files import MEGABYTE, read_bounded
+from marl_handover.files import MEGABYTE, read_bounded, read_lines
 
 DEPTH, DIGITS, NODES = 50, 40, 100_000
 """How deep lists and mappings may nest, how many digits a whole number may have, how many values a YAML file may unfold to."""
@@ -74,6 +75,21 @@ def read_json(path: Path, what: str, limit_bytes: int = JSON_BYTES, finite: bool
         return parse_object(content, finite)
     except ValueError as error:
         raise CorruptFile(what, path, str(error)) from error
+
+
+def read_rows(path: Path, what: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    """The objects of a file of JSON Lines that grows, numbers that are none included; see :func:`~marl_handover.files.read_lines`."""
+    return read_lines(path, LINES_BYTES, what, _row)
+
+
+def _row(line: bytes) -> dict[str, Any]:
+    try:
+        row = parse_json(line, finite=False)
+    except ValueError as error:
+        raise ValueError("is not JSON") from error
+    if not isinstance(row, dict):
+        raise ValueError("is not an object in braces")
+    return row
 
 
 def parse_yaml(text: str) -> dict[str, Any]:

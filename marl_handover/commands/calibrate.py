@@ -81,14 +81,14 @@ def run(config: CalibrateCommand) -> int:
 
 def _sheets(config: CalibrateCommand, model: CellModel) -> int:
     from marl_handover.perception.boards import marker_sheet
-    from marl_handover.perception.sheets import DPI, PX_PER_MM, page, write_sheets
+    from marl_handover.perception.sheets import PX_PER_MM, page, save_sheet, write_sheets
 
     folder, cards, target = config.folder() / "sheets", config.cards, config.target
     files = write_sheets(folder, model.cell.config.block, target, config.board, config.paper)
     sheets = [marker_sheet(target.dictionary, number, cards.marker_mm, cards.marker_mm + _CUT_MM, PX_PER_MM) for number in cards.ids]
     words = f"markers {cards.ids[0]} for the left hand, {cards.ids[1]} for the right: flat on top, upper edge to the left"
     files.append(folder / "hands.pdf")
-    page(sheets, config.paper, "hands", words).save(files[-1], resolution=DPI)
+    save_sheet(page(sheets, config.paper, "hands", words), files[-1])
     for path in files:
         print(path)
     return 0

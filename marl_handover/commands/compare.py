@@ -144,7 +144,7 @@ def _report(suite: Suite, whole: Suite, tasks: Sequence[Task], failures: dict[st
     results = gather(suite, tasks, failures, whole)
     figures = dict(make_figures(results))
     results["empty_figures"] = [name for name, figure in figures.items() if figure is None]
-    write_json(out / "results.json", results, "out")
+    write_json(out / "results.json", results)
     tables = make_tables(results)
     (out / "tables").mkdir(exist_ok=True)
     for table in tables:

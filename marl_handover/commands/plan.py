@@ -93,7 +93,7 @@ def run(config: PlanConfig) -> int:
     if planner is not None:
         _move(config, plan, planner)  # first: if there is no motion, nothing is written
     if config.json:
-        write_json(Path(config.json), plan, "json")
+        write_json(Path(config.json), plan)
     if config.picture:
         from marl_handover.report.plan import plan_figure
 
@@ -132,7 +132,7 @@ def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> N
         )
     if config.motion:
         settings = {"cell_settings": asdict(planner.model.cell.config), "motion_settings": asdict(planner.motion)}
-        write_json(Path(config.motion), {**settings, "transfers": [motion_row(motion) for motion in motions]}, "motion")
+        write_json(Path(config.motion), {**settings, "transfers": [motion_row(motion) for motion in motions]})
     if config.motion_picture:
         from marl_handover.report.motion import motion_figure
 

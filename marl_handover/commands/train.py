@@ -29,6 +29,8 @@ def run(config: TrainConfig) -> int:
     Raises:
         FolderBusy: another process trains in that folder.
     """
+    import torchrl  # noqa: F401 - sets its own level
+
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     if config.resume:
         folder = Path(config.resume)

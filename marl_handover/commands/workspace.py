@@ -37,7 +37,7 @@ def run(config: WorkspaceConfig) -> int:
     model = build_cell(config.cell)
     summary = workspace_summary(model)
     out = Path(config.out)
-    write_json(out / FILE, summary, "out")
+    write_json(out / FILE, summary)
     save_figure(workspace_figure(model), out / PICTURE)
     print(_text(summary))
     print(f"written: {out / FILE}, {out / PICTURE}")

@@ -8,42 +8,18 @@ task fails, and is given to Ray again.
 
 from __future__ import annotations
 
-import importlib
 import logging
-import os
-import socket
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing
 from typing import Any
 
 from joblib.parallel import ParallelBackendBase
 
+from marl_handover.cluster import ClusterUnavailable, connected, require_ray
 from marl_handover.compare.workers import Outcome, died, run_parallel, summary
-from marl_handover.errors import InvalidSetting, MissingExtra, WorkFailed
 
 LOG = logging.getLogger(__name__)
-PROBE_S = 5.0
-"""How long to wait for an answer at an address. Ray itself would try for two minutes and then end the process."""
-
-
-class ClusterUnavailable(WorkFailed):
-    """No Ray cluster can be used at an address. ``absent``: nothing answers there, so that starting one may help."""
-
-    def __init__(self, address: str, reason: str, absent: bool = True) -> None:
-        advice = "; start one with: ray start --head" if absent else ""
-        super().__init__(f"no Ray cluster at address={address}: {reason}{advice}")
-        self.address, self.reason = address, reason
-
-
-def require_ray() -> Any:
-    """The module ray. Raises :class:`MissingExtra`."""
-    # Ray looks for updates of its usage statistics' settings over the network, and reports to its makers, unless told not to.
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        return importlib.import_module("ray")
-    except ImportError as error:
-        raise MissingExtra("launcher=ray", "ray", "ray") from error
 
 
 def through_ray(
@@ -52,7 +28,7 @@ def through_ray(
     """The outcome of each parcel as it is done, on the cluster at ``address``; see :func:`marl_handover.compare.launch.fan_out`."""
     if not parcels:
         return
-    with _cluster(require_ray(), address, jobs) as ray:
+    with connected(require_ray("launcher=ray"), address, jobs) as ray:
         cores = int(ray.cluster_resources().get("CPU", 0))
         if not cores:
             raise ClusterUnavailable(address, "it has no cores")
@@ -144,45 +120,3 @@ def _call(batch: Any) -> list[Outcome]:
     """What a task does."""
     outcomes: list[Outcome] = batch()
     return outcomes
-
-
-@contextmanager
-def _cluster(ray: Any, address: str, jobs: int) -> Iterator[Any]:
-    """Ray, connected; disconnected in the end unless it was connected before."""
-    if ray.is_initialized():
-        yield ray
-        return
-    address = address or "auto"
-    target = os.environ.get("RAY_ADDRESS", address) if address == "auto" else address
-    options: dict[str, Any] = {"num_cpus": jobs or None, "include_dashboard": False} if target == "local" else {}
-    _probe(target)
-    try:
-        ray.init(address=target, log_to_driver=False, logging_level=logging.ERROR, **options)
-    except ValueError as error:
-        raise InvalidSetting("address", address, f"auto, local, host:port or ray://host:port ({summary(error)})") from error
-    except (ConnectionError, RuntimeError, SystemExit) as error:
-        alone = error.__cause__ is None and error.__context__ is None
-        raise ClusterUnavailable(address, _root_cause(error), absent=alone and isinstance(error, ConnectionError)) from error
-    try:
-        yield ray
-    finally:
-        ray.shutdown()
-
-
-def _root_cause(error: BaseException) -> str:
-    """First line of the error that all others came of: Ray wraps what happened, a version that does not fit say, in advice to start Ray."""
-    while (deeper := error.__cause__ or error.__context__) is not None:
-        error = deeper
-    lines = [" ".join(line.split()).rstrip(".") for line in str(error).splitlines() if line.strip()]
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
-
-
-def _probe(address: str) -> None:
-    """Raise :class:`ClusterUnavailable` at once if nobody listens at ``host:port``; other forms of address pass."""
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if not colon or not port.isdecimal():
-        return
-    try:
-        socket.create_connection((host, int(port)), timeout=PROBE_S).close()
-    except (OSError, OverflowError) as error:
-        raise ClusterUnavailable(address, getattr(error, "strerror", None) or str(error)) from error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import os
 import re
 import socket
@@ -9,21 +11,22 @@ import threading
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import optuna
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
 from optuna.study import Study
 from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
-from marl_handover.errors import HandoverError
-from marl_handover.files import expanded
+from marl_handover.errors import CorruptFile, HandoverError
+from marl_handover.files import GrowingFile, expanded, make_folder
 from marl_handover.locks import held
 
+LOG = logging.getLogger(__name__)
 BEAT_S = 60.0
 """A trial that runs says so this often ..."""
 SILENT_S = 600.0
@@ -42,6 +45,51 @@ class StorageUnavailable(HandoverError):
 
     def __init__(self, storage: str, reason: str) -> None:
         super().__init__(f"storage={hidden(storage)}: {' '.join(hidden(reason).split())}")
+
+
+class Journal(JournalFileBackend):
+    """Optuna's journal file, in which a line that was cut off, by a full disk or a killed process, is no end of the study.
+
+    It is taken away before the next one is appended, which Optuna would put behind it on the same line. A warning says so.
+
+    Raises:
+        CorruptFile: there is something else than a regular file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._own = path, JournalFileSymlinkLock(str(path))
+        if path.exists() and not path.is_file():
+            raise CorruptFile("journal", path, "it is no regular file")
+        super().__init__(str(path), self._own)
+        if not self._whole():
+            with self._locked():
+                pass
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """As the base class; what there is no room for is taken back."""
+        with self._locked(), closing(GrowingFile(self.path)) as file:
+            file.write("".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs))
+            file.to_disk()
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Be the only writer, of a file that ends with a whole line."""
+        self._own.acquire()
+        try:
+            if not self._whole():
+                content = self.path.read_bytes()
+                LOG.warning("journal %s was cut off in its last line, which is taken away", self.path)
+                os.truncate(self.path, content.rfind(b"\n") + 1)
+            yield
+        finally:
+            self._own.release()
+
+    def _whole(self) -> bool:
+        with self.path.open("rb") as stream:
+            if stream.seek(0, os.SEEK_END) == 0:
+                return True
+            stream.seek(-1, os.SEEK_END)
+            return stream.read(1) == b"\n"
 
 
 def hidden(text: str) -> str:
@@ -74,14 +122,17 @@ def open_storage(storage: str) -> BaseStorage:
 
     Raises:
         StorageUnavailable: for one line about whatever is wrong with it.
+        CorruptFile, CannotWrite: a journal is no regular file, or there is no room for it.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         if "://" not in storage:
-            Path(storage).parent.mkdir(parents=True, exist_ok=True)
-            return JournalStorage(JournalFileBackend(storage))
+            make_folder(Path(storage).parent)
+            return JournalStorage(Journal(Path(storage)))
         wait: dict[str, Any] = {"connect_args": {"timeout": SQLITE_WAIT_S}} if storage.startswith("sqlite") else {"pool_pre_ping": True}
         return RDBStorage(storage, engine_kwargs=wait)
+    except HandoverError:
+        raise
     except ImportError as error:
         missing = getattr(error.__cause__ or error, "name", None) or "its driver"
         raise StorageUnavailable(storage, f"needs the package {missing}; run: pip install {DRIVERS.get(missing, missing)}") from None

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.config import require_choice
-from marl_handover.errors import CorruptFile, HandoverError, InvalidSetting, MissingFile
-from marl_handover.files import keep, write_whole
+from marl_handover.errors import CorruptFile, HandoverError, MissingFile
+from marl_handover.files import keep, make_folder, write_whole
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.settings import ARMS, HardwareConfig
@@ -127,16 +127,17 @@ class ArmCalibration:
     def save(self, path: Path | str) -> Path | None:
         """Write the file as a whole. What was there is kept beside it; its path, or None.
 
-        Raises :class:`InvalidSetting` if it cannot be written.
+        Raises :class:`~marl_handover.errors.CannotWrite`.
         """
         path = Path(path)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            backup = keep(path)
-            write_whole(path, json.dumps(self._content(), indent=2, allow_nan=False) + "\n")
-        except OSError as error:
-            raise InvalidSetting("calibration", str(path), f"a file that can be written ({error.strerror or error})") from error
+        make_folder(path.parent)
+        backup = keep(path)
+        write_whole(path, self.text())
         return backup
+
+    def text(self) -> str:
+        """What the file holds."""
+        return json.dumps(self._content(), indent=2, allow_nan=False) + "\n"
 
     def _content(self) -> dict[str, Any]:
         joints = {

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import sys
+import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, wait
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
-from typing import Any
+from multiprocessing.process import BaseProcess
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -16,16 +21,25 @@ from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
 from torchrl.weight_update import MultiProcessWeightSyncScheme
 
 from marl_handover.cell import build_cell
+from marl_handover.cluster import connected, require_ray
 from marl_handover.config import MotionConfig
 from marl_handover.envs.flat_aec import fields_of
 from marl_handover.envs.spaces import SUPERVISOR, Spaces
 from marl_handover.envs.supervisor_env import SupervisorEnv
-from marl_handover.errors import WorkFailed
+from marl_handover.errors import HandoverError, WorkFailed, first_line
 from marl_handover.learning.aec_policy import AecPolicy, WorkerPolicy, make_env, message, supervisor_fields
 from marl_handover.learning.experience import Collected, Experience, Explore
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.turns import TurnReader
 from marl_handover.task.rules import Outcome
+
+Result = TypeVar("Result")
+
+LOOK_S = 1.0
+"""How often it is looked whether the workers live."""
+GRACE_S = 5.0
+"""So long an answer may still be under way from a worker that has ended."""
+SHUTDOWN_S = 20.0
 
 TURNS = 2
 """Steps of the environment a decision, the supervisor's turn and an arm's; in architecture A sometimes one more."""
@@ -61,6 +75,7 @@ class AecExperience(Experience):
         self._collector: BaseCollector | None = None
         self._batches: Iterator[TensorDictBase] = iter(())
         self._policy: AecPolicy | None = None
+        self._cluster = ExitStack()
         self._reader = TurnReader(SUPERVISOR)
         self._running: TensorDict | None = None
 
@@ -69,6 +84,7 @@ class AecExperience(Experience):
 
         Raises:
             WorkerLost: a worker is gone.
+            ClusterUnavailable, MissingExtra: of ``collector=ray``.
         """
         if self.config.collector == "local":
             rollout = self._steps(explore)
@@ -76,8 +92,10 @@ class AecExperience(Experience):
             told = TensorDict(message(explore, self.env.epsilon_range_rad))
             try:
                 rollout = self._steps(explore, told)
+            except HandoverError:
+                raise
             except Exception as error:  # a queue's, a pipe's, Ray's or TorchRL's own
-                raise WorkerLost(self.config.collector, (str(error).strip().splitlines() or [type(error).__name__])[0]) from error
+                raise WorkerLost(self.config.collector, first_line(error)) from error
         steps = int(rollout[SUPERVISOR, "mask"].sum())
         self.decisions += steps
         rows, ended = self._finished(self._reader.read(rollout).to(self.env.device))
@@ -97,7 +115,8 @@ class AecExperience(Experience):
     def close(self) -> None:
         """End the workers and close the environments."""
         if self._collector is not None:
-            self._collector.shutdown()
+            _shut_down(self._collector)
+        self._cluster.close()
         self._collector, self._policy = None, None
         self._reader, self._running = TurnReader(SUPERVISOR), None
 
@@ -108,11 +127,12 @@ class AecExperience(Experience):
             self._batches = iter(self._collector)
         if self._policy is not None:
             self._policy.explore, self._policy.epsilon_range_rad = explore, self.env.epsilon_range_rad
-        else:
-            for worker in getattr(self._collector, "procs", ()):  # from a dead one TorchRL would wait for an answer for ever
-                if not worker.is_alive():
-                    raise ChildProcessError(f"process {worker.pid} ended with {worker.exitcode}")
-            self._collector.update_policy_weights_(told)
+            return next(self._batches)
+        return watched(partial(self._told_steps, told), lambda: getattr(self._collector, "procs", ()))
+
+    def _told_steps(self, told: TensorDict | None) -> TensorDictBase:
+        assert self._collector is not None
+        self._collector.update_policy_weights_(told)
         return next(self._batches)
 
     def _start(self, explore: Explore) -> BaseCollector:
@@ -127,8 +147,17 @@ class AecExperience(Experience):
             return Collector(own, self._policy, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=False)
         makers = [partial(make_env, config, own[1:]) for own in seeds]
         actors = [partial(WorkerPolicy, config, cells, own[0]) for own in seeds]
-        start = {"multiprocess": _processes, "ray": _ray_actors}[config.collector]
-        return start([*makers], [*actors], frames)
+        if config.collector == "ray":
+            self._cluster.enter_context(_cluster(workers))
+            return _ray_actors([*makers], [*actors], frames)
+        others = set(multiprocessing.active_children())
+        born: set[BaseProcess] = set()
+
+        def started() -> set[BaseProcess]:
+            born.update(set(multiprocessing.active_children()) - others)  # it forgets those that have ended
+            return born
+
+        return watched(partial(_processes, [*makers], [*actors], frames), started)
 
     def _finished(self, turns: TensorDict) -> tuple[TensorDict | None, torch.Tensor]:
         """Rows of the episodes that ended, and their number, that of the solved ones, and the transfers they took."""
@@ -180,6 +209,49 @@ class AecExperience(Experience):
         return rows
 
 
+def watched(work: Callable[[], Result], workers: Callable[[], Iterable[BaseProcess]]) -> Result:
+    """The result of ``work``, for which it may wait as long as all of ``workers`` live.
+
+    From one that was killed TorchRL can wait for an answer for ever: where it does not look whether it lives, and where a worker died with
+    a lock that the others need, or in the middle of a message. So the waiting is done in a thread, which is left behind then.
+
+    Raises:
+        ChildProcessError: a worker is gone, and the work did not end by itself.
+    """
+    done: Future[Result] = Future()
+
+    def run() -> None:
+        try:
+            done.set_result(work())
+        except BaseException as error:
+            done.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    while not wait([done], LOOK_S).done:
+        dead = next((worker for worker in workers() if worker.exitcode is not None), None)
+        if dead is not None and not wait([done], GRACE_S).done:
+            raise ChildProcessError(f"process {dead.pid} ended with {dead.exitcode}")
+    return done.result()
+
+
+def _shut_down(collector: BaseCollector) -> None:
+    """End the workers, those that do not listen any more too."""
+    closing = threading.Thread(target=collector.shutdown, daemon=True)
+    closing.start()
+    closing.join(SHUTDOWN_S)
+    for worker in getattr(collector, "procs", ()):
+        if not worker._closed and worker.is_alive():
+            worker.kill()
+            worker.join(GRACE_S)
+
+
+def _cluster(workers: int) -> AbstractContextManager[Any]:
+    """The Ray cluster this process belongs to, else that of ``RAY_ADDRESS``, else one of its own on this machine."""
+    ray = require_ray("collector=ray")
+    cores = max(workers, os.cpu_count() or 1)
+    return connected(ray, os.environ.get("RAY_ADDRESS", "local"), cores, "RAY_ADDRESS")
+
+
 def _processes(makers: list[Callable[[], Any]], actors: list[Callable[[], Any]], frames: int) -> BaseCollector:
     """One process a worker on this machine."""
     return MultiSyncCollector(
@@ -194,12 +266,9 @@ def _processes(makers: list[Callable[[], Any]], actors: list[Callable[[], Any]],
 
 
 def _ray_actors(makers: list[Callable[[], Any]], actors: list[Callable[[], Any]], frames: int) -> BaseCollector:
-    """One Ray actor a worker: on the cluster this process belongs to, else that of ``RAY_ADDRESS``, else one of its own on this machine."""
+    """One Ray actor a worker."""
     from torchrl.collectors.distributed import RayCollector
 
-    own: dict[str, Any] = {"log_to_driver": False, "logging_level": "warning", "include_dashboard": False}
-    if "RAY_ADDRESS" not in os.environ:
-        own["num_cpus"] = max(len(makers), os.cpu_count() or 1)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="The policy is not an nn.Module")  # the workers' are, which is what counts
         return RayCollector(
@@ -208,6 +277,5 @@ def _ray_actors(makers: list[Callable[[], Any]], actors: list[Callable[[], Any]]
             frames_per_batch=frames,
             total_frames=sys.maxsize,  # it takes -1 for nothing at all
             sync=True,
-            ray_init_config=own,
             remote_configs={"num_cpus": 1},
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.errors import CorruptFile, HandoverError, MissingFile, WorkFailed
-from marl_handover.files import write_whole
+from marl_handover.files import copy_whole, make_folder, write_whole
 from marl_handover.parsing import read_json
 from marl_handover.perception.settings import MountConfig
 
@@ -114,10 +113,10 @@ class CameraCalibration:
     def save(self, path: Path | str) -> None:
         """Write the JSON file as a whole; the one that was there stays beside it, its name ending in ``.bak``."""
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         text = json.dumps(self._content(), indent=1) + "\n"
         if path.exists():
-            shutil.copy2(path, path.with_name(path.name + ".bak"))
+            copy_whole(path, path.with_name(path.name + ".bak"))
         write_whole(path, text)
 
     def _content(self) -> dict[str, Any]:

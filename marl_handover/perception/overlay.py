@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from marl_handover.errors import CorruptFile
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels
 
 QUALITY = 80
+LARGEST_PX = 20_000_000
 _THIN_PX, _THICK_PX, _LETTERS = 2, 5, 0.8
 _GAP_PX = 8
 _DARK = (20, 20, 20)
@@ -47,18 +50,23 @@ def jpeg(image: Pixels) -> bytes:
     return bytes(content)
 
 
-def read_picture(path: Path) -> Pixels:
-    """The picture in a file, RGB (height, width, 3).
+def decoded(content: bytes, path: Path, formats: tuple[str, ...] = ("JPEG", "PNG")) -> Pixels:
+    """The picture that a file at ``path`` holds, BGR (height, width, 3). How large it is is looked at first.
 
     Raises:
-        OSError: it cannot be read.
-        CorruptFile: it is no picture.
+        CorruptFile: it is no such picture, or larger than :data:`LARGEST_PX`.
     """
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    image = cv2.imdecode(content, cv2.IMREAD_COLOR) if content.size else None
+    try:
+        with Image.open(io.BytesIO(content), formats=formats) as head:
+            width, height = head.size
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise CorruptFile("picture", path, f"it is no {' or '.join(formats)} file") from error
+    if width * height > LARGEST_PX:
+        raise CorruptFile("picture", path, f"it has {width} x {height} pixels, more than {LARGEST_PX}")
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
-        raise CorruptFile("picture", path, "it is no JPEG or PNG file")
-    return np.ascontiguousarray(image[..., ::-1])
+        raise CorruptFile("picture", path, f"it is no {' or '.join(formats)} file")
+    return np.asarray(image, dtype=np.uint8)
 
 
 def _lines_mm(mark: Mark) -> Floats:

@@ -7,12 +7,14 @@ If it is not, print again: with a board printed at 99 % every length on the tabl
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from marl_handover.config import BlockConfig, require_choice
 from marl_handover.errors import InvalidSetting
+from marl_handover.files import make_folder, writing
 from marl_handover.perception.boards import Sheet, block_top, charuco_sheet, marker_sheet
 from marl_handover.perception.settings import BoardConfig, TargetConfig
 
@@ -47,7 +49,7 @@ def write_sheets(
     target, board = target or TargetConfig(), board or BoardConfig()
     target.validate()
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     tops = [block_top(block, target, PX_PER_MM)] * 6
     goals = [marker_sheet(target.dictionary, target.goal_id, target.goal_mm, target.goal_mm + 10, PX_PER_MM)] * 2
     table = [marker_sheet(target.dictionary, number, TABLE_MARKER_MM, TABLE_MARKER_MM + 14, PX_PER_MM) for number in TABLE_MARKERS]
@@ -63,9 +65,16 @@ def write_sheets(
     for name, image in pages.items():
         for suffix in (".png", ".pdf"):
             path = folder / f"{name}{suffix}"
-            image.save(path, **({"resolution": DPI} if suffix == ".pdf" else {"dpi": (DPI, DPI)}))
+            save_sheet(image, path)
             files.append(path)
     return files
+
+
+def save_sheet(image: Image.Image, path: Path) -> None:
+    """Write a page, in its true size, as PNG or PDF. Raises :class:`~marl_handover.errors.CannotWrite`."""
+    kind: dict[str, Any] = {"format": "PDF", "resolution": DPI} if path.suffix == ".pdf" else {"format": "PNG", "dpi": (DPI, DPI)}
+    with writing(path) as stream:
+        image.save(stream, **kind)
 
 
 def page(sheets: list[Sheet], paper: str, title: str, words: str, *, arrows: bool = False, pierced: bool = False) -> Image.Image:

@@ -16,8 +16,10 @@ import cv2
 import numpy as np
 
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
+from marl_handover.files import read_bounded
 from marl_handover.perception.calibration import Pixels
 from marl_handover.perception.camera import Camera, Clock, EndOfFrames, Frame, LiveCamera, NoCamera, RenderedCamera, Reopening
+from marl_handover.perception.overlay import decoded
 from marl_handover.perception.settings import CameraConfig
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -25,6 +27,8 @@ BY_ID = "/dev/v4l/by-id/*"
 INSTALL_REALSENSE = 'pip install "marl_handover[realsense]" (and, on Debian or Ubuntu, apt install libusb-1.0-0)'
 
 _MS = 1000
+_PICTURE_BYTES = 100_000_000
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF")
 
 
 def open_camera(config: CameraConfig, picture: Callable[[], Pixels | Frame] | None = None, clock: Clock = time.monotonic) -> Camera:
@@ -105,10 +109,7 @@ def _folder(path: Path, frames_per_s: float) -> Iterator[tuple[float, Pixels]]:
 
     def pictures() -> Iterator[tuple[float, Pixels]]:
         for number, file in enumerate(files):
-            image = cv2.imread(str(file), cv2.IMREAD_COLOR)
-            if image is None:
-                raise CorruptFile("picture", file, "it cannot be decoded")
-            yield number / frames_per_s, np.asarray(image, dtype=np.uint8)
+            yield number / frames_per_s, decoded(read_bounded(file, _PICTURE_BYTES, "picture"), file, _FORMATS)
 
     return pictures()
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.files import temporary_of, write_whole
+from marl_handover.files import make_folder, write_whole, writing
 
 PICTURES = (".png", ".pdf", ".svg")
 DOTS_PER_INCH = 150
@@ -31,31 +29,15 @@ def save_figure(figure: Figure, path: Path, name: str = "out") -> None:
     """Write a figure in the format of the path's suffix; a reader sees the old file or the new one. ``name`` is the setting's."""
     suffix = require_picture(name, path).suffix.lower()
     FigureCanvasAgg(figure)
-    with _writable(path, name) as temporary:
-        # Without a date, the same picture is the same file.
-        metadata = {".png": None, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}[suffix]
-        with matplotlib.rc_context({"pdf.fonttype": 42}):  # text stays text, in a font that editors and publishers take
-            figure.savefig(temporary, format=suffix[1:], dpi=DOTS_PER_INCH, metadata=metadata)
-        temporary.replace(path)
+    make_folder(path.parent)
+    # Without a date, the same picture is the same file.
+    metadata = {".png": None, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}[suffix]
+    # In this type text stays text, in a font that editors and publishers take.
+    with matplotlib.rc_context({"pdf.fonttype": 42}), writing(path) as stream:
+        figure.savefig(stream, format=suffix[1:], dpi=DOTS_PER_INCH, metadata=metadata)
 
 
-def write_json(path: Path, content: dict[str, Any], name: str) -> None:
-    """Write a JSON file as a whole. ``name`` is the setting that named it."""
-    with _writable(path, name):
-        write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
-
-
-@contextmanager
-def _writable(path: Path, name: str) -> Iterator[Path]:
-    """Make the folder of ``path``, give the temporary file's path, and leave no temporary file behind, whatever happens."""
-    temporary = temporary_of(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_dir():
-            raise IsADirectoryError(None, "it is a folder")
-        yield temporary
-    except OSError as error:
-        raise InvalidSetting(name, str(path), f"a file that can be written ({error.strerror or error})") from error
-    finally:
-        if path.parent.is_dir():
-            temporary.unlink(missing_ok=True)
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON file as a whole."""
+    make_folder(path.parent)
+    write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import LoopConfig
-from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
-from marl_handover.parsing import parse_object
+from marl_handover.errors import CorruptFile, InvalidSetting
+from marl_handover.files import read_lines
+from marl_handover.parsing import LINES_BYTES, parse_object
 from marl_handover.runtime.reach import drawn_in
 from marl_handover.task.rules import ROUNDING_RAD, Command, Outcome, Rules
 
@@ -62,8 +63,6 @@ def read_trace(path: Path) -> Trace:
     Raises:
         MissingFile, CorruptFile: with the line's number.
     """
-    if not path.is_file():
-        raise MissingFile("trace", path)
     first: dict[int, dict[str, Any]] = {}
     last: dict[int, dict[str, Any]] = {}
     count: dict[int, int] = {}
@@ -96,15 +95,16 @@ def read_trace(path: Path) -> Trace:
 
 def _steps(path: Path) -> Iterator[dict[str, Any]]:
     """Every step of a first attempt."""
-    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
-        try:
-            row = parse_object(line)
-            if int(row.get("attempt", 0)) > 0:
-                continue
-            step = _step(row)
-        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-            raise CorruptFile("trace", path, f"line {number} is no step of an episode") from error
-        yield step
+    return (step for _, step in read_lines(path, LINES_BYTES, "trace", _parsed) if step is not None)
+
+
+def _parsed(line: bytes) -> dict[str, Any] | None:
+    """A line's step; None if it is of a later attempt."""
+    try:
+        row = parse_object(line)
+        return None if int(row.get("attempt", 0)) > 0 else _step(row)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise ValueError("is no step of an episode") from error
 
 
 def _step(row: dict[str, Any]) -> dict[str, Any]:

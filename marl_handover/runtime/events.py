@@ -17,7 +17,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from marl_handover.errors import InvalidSetting
+from marl_handover.errors import CannotWrite
+from marl_handover.files import GrowingFile
 
 
 class Event(StrEnum):
@@ -80,22 +81,22 @@ FAULTS = frozenset(Event) - NOTES
 class EventLog:
     """Writes events to a file as they come, and counts them.
 
+    A file that has no room any more ends with its last whole line. That interrupts nothing: :meth:`require_written` tells of it.
+
     Args:
         clock: gives ``t_s``.
         path: of the file; empty: only counted.
         listener: is shown each line as well.
 
     Raises:
-        InvalidSetting: if the file cannot be written.
+        CannotWrite: the file cannot be opened.
     """
 
     def __init__(self, clock: Callable[[], float], path: str = "", listener: Callable[[dict[str, Any]], None] | None = None) -> None:
         self._clock, self._listener = clock, listener
         self.counts: Counter[Event] = Counter()
-        try:
-            self._file = Path(path).open("w", encoding="utf-8") if path else None  # noqa: SIM115 - closed by close()
-        except OSError as error:
-            raise InvalidSetting("log", path, f"a file that can be written ({error.strerror or error})") from error
+        self._file = GrowingFile(Path(path), fresh=True) if path else None
+        self._failure: CannotWrite | None = None
 
     @property
     def verbose(self) -> bool:
@@ -114,11 +115,22 @@ class EventLog:
         if not self.verbose:
             return
         row = {"t_s": round(self._clock(), 4), "event": str(event), **{name: _plain(value) for name, value in fields.items()}}
-        if self._file is not None:
-            self._file.write(json.dumps(row, allow_nan=False) + "\n")
-            self._file.flush()
+        self._write(row)
         if self._listener is not None:
             self._listener(row)
+
+    def _write(self, row: dict[str, Any]) -> None:
+        if self._file is None or self._failure is not None:
+            return
+        try:
+            self._file.write(json.dumps(row, allow_nan=False) + "\n")
+        except CannotWrite as failure:  # arms may be moving: nothing of that is to stop here
+            self._failure = failure
+
+    def require_written(self) -> None:
+        """Raise the :class:`CannotWrite` of a line that is missing. To be called where arms are parked."""
+        if self._failure is not None:
+            raise self._failure
 
     def show(self, listener: Callable[[dict[str, Any]], None]) -> None:
         """Show ``listener`` each line from now on, in place of whoever was shown them before."""

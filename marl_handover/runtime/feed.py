@@ -11,13 +11,16 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from marl_handover.errors import CorruptFile, InvalidSetting, WorkFailed
-from marl_handover.files import write_whole
+import numpy as np
+
+from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, WorkFailed
+from marl_handover.files import open_bounded, read_bounded, write_whole
 from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.roll import Roll, Signed
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.parsing import parse_json
 from marl_handover.perception.calibration import Pixels
-from marl_handover.perception.overlay import read_picture
+from marl_handover.perception.overlay import decoded
 from marl_handover.runtime.steering import Ask, control_name
 
 STATE_FILE, PICTURE_FILE, EVENTS_FILE = "state.json", "picture.jpg", "events.jsonl"
@@ -27,6 +30,7 @@ SILENT_S = 2.0
 """No news for longer than this is said."""
 
 _TAIL_BYTES = 65536
+_STATE_BYTES, _PICTURE_BYTES, _EVENTS_BYTES, _LATCH_BYTES = 1_000_000, 8_000_000, 10**12, 100_000
 _LARGEST = 1e15
 """No number in a folder is larger; infinity is, and what is not a number is not smaller."""
 
@@ -69,8 +73,10 @@ class Feed:
         """The newest state."""
         trouble = ""
         try:
-            self._state = _checked(_loaded((self.folder / STATE_FILE).read_bytes()), self.folder / STATE_FILE)
-        except FileNotFoundError:
+            require_own(self.folder)
+            content = read_bounded(self.folder / STATE_FILE, _STATE_BYTES, "state file", own=True)
+            self._state = _checked(_loaded(content), self.folder / STATE_FILE)
+        except (FileNotFoundError, MissingFile):
             trouble = f"{self.folder} holds no session yet" if self._state is None else f"{self.folder} was emptied or taken away"
         except (OSError, ValueError, CorruptFile) as error:
             trouble = str(error) if isinstance(error, CorruptFile) else f"the state file cannot be read: {error}"
@@ -99,8 +105,8 @@ class Feed:
             mark = (found.st_mtime_ns, found.st_ino)
             if mark == self._picture:
                 return None
-            image = read_picture(path)
-        except (OSError, CorruptFile):
+            image = np.ascontiguousarray(decoded(read_bounded(path, _PICTURE_BYTES, "picture", own=True), path)[..., ::-1])
+        except (OSError, CorruptFile, MissingFile):
             return None
         self._picture = mark
         return image
@@ -110,13 +116,13 @@ class Feed:
         session = "" if self._state is None else str(self._state["session"])
         path = self.folder / EVENTS_FILE
         try:
-            size = path.stat().st_size
-            if session != self._events_of or size < self._offset:
-                self._events_of, self._offset = session, max(0, size - _TAIL_BYTES)
-            with path.open("rb") as stream:
+            with open_bounded(path, _EVENTS_BYTES, "events", own=True) as stream:
+                size = os.fstat(stream.fileno()).st_size
+                if session != self._events_of or size < self._offset:
+                    self._events_of, self._offset = session, max(0, size - _TAIL_BYTES)
                 stream.seek(self._offset)
                 content = stream.read(_TAIL_BYTES)
-        except OSError:
+        except (OSError, CorruptFile, MissingFile):
             return []
         whole = content[: content.rfind(b"\n") + 1] or (content if len(content) == _TAIL_BYTES else b"")
         inside = self._offset > 0 and self._offset == size - _TAIL_BYTES
@@ -149,27 +155,61 @@ class Feed:
         return number
 
     def latch(self) -> StopLatch:
-        """The stop of this session; before any state was read, the usual one."""
-        path = (self._state or {}).get("stop_file") or HardwareConfig().stop_path()
+        """The stop of this session; before any state was read, the usual one. What the session signed up with is believed first."""
+        signed = self._signed()
+        path = signed.stop_file if signed is not None else (self._state or {}).get("stop_file") or HardwareConfig().stop_path()
         return StopLatch(str(path))
+
+    def _signed(self) -> Signed | None:
+        """The session as it is on this user's roll; None if it is not."""
+        state = self._state
+        if state is None or not _here(state):
+            return None
+        return next((session for session in Roll().signed() if session.pid == state["pid"]), None)
 
     def stop(self, reason: str) -> str:
         """Latch the stop: allowed whatever ``view_control`` says. What was done, for people.
 
-        If the latch cannot be written, the session's process is interrupted, which stops every channel too; but only on its own computer.
+        A file that is no stop file is not replaced, whatever the state says. If the latch cannot be written, the session's process is
+        interrupted, which stops every channel too; but only one that has signed up on this computer.
         """
-        reading = self.read()
-        latch = self.latch()
-        try:
-            latch.latch(reason)
-            return f"stop latched in {latch.path}"
-        except OSError as error:
-            failed = f"the stop file {latch.path} cannot be written ({error.strerror or error})"
-        if reading.live and reading.state is not None and _here(reading.state) and reading.state["pid"] > 1:  # 1 holds up all others
+        reading, latch = self.read(), self.latch()
+        failed = _not_a_latch(latch.path)
+        if not failed:
+            try:
+                latch.latch(reason)
+                return f"stop latched in {latch.path}"
+            except OSError as error:
+                failed = f"the stop file {latch.path} cannot be written ({error.strerror or error})"
+        signed = self._signed()
+        if reading.live and signed is not None:
             with contextlib.suppress(OSError, OverflowError):
-                os.kill(reading.state["pid"], signal.SIGINT)
-                return f"{failed}; interrupted process {reading.state['pid']} instead"
+                os.kill(signed.pid, signal.SIGINT)
+                return f"{failed}; interrupted process {signed.pid} instead"
         return f"{failed}: CUT THE POWER"
+
+
+def require_own(folder: Path) -> None:
+    """See that a session's folder belongs to this user: others could write anything into theirs.
+
+    Raises:
+        CorruptFile: it does not.
+        FileNotFoundError: it is not there.
+    """
+    owner = os.stat(folder).st_uid
+    if owner != os.geteuid():
+        raise CorruptFile("session folder", folder, f"it belongs to another user ({owner}); look into it as that user")
+
+
+def _not_a_latch(path: Path) -> str:
+    """What is wrong with the place of a stop file; empty if there is none yet, one without a word, or one that a newer one may replace."""
+    try:
+        content = _loaded(read_bounded(path, _LATCH_BYTES, "stop file") or b'{"reason": ""}')
+    except MissingFile:
+        return ""
+    except (CorruptFile, ValueError, RecursionError):
+        content = None
+    return "" if isinstance(content, dict) and "reason" in content else f"{path} is no stop file, and was not replaced by one"
 
 
 def _checked(content: Any, path: Path) -> dict[str, Any]:
@@ -185,7 +225,7 @@ def _checked(content: Any, path: Path) -> dict[str, Any]:
     if content["pid"] < 1:  # others mean groups of processes
         raise CorruptFile("state file", path, f"its pid is {content['pid']}")
     stop_file = content.get("stop_file", "")
-    if not isinstance(stop_file, str) or "\0" in stop_file:
+    if not isinstance(stop_file, str) or "\0" in stop_file or not (stop_file == "" or os.path.isabs(stop_file)):
         raise CorruptFile("state file", path, f"its stop_file is {stop_file!r}")
     return content
 

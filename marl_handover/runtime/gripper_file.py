@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from marl_handover.config import require_between
-from marl_handover.errors import CorruptFile, InvalidSetting
+from marl_handover.errors import CorruptFile
 from marl_handover.files import keep, write_whole
 from marl_handover.hardware.calibration import CalibrationProblem
 from marl_handover.hardware.protocol import PULSE_US
@@ -41,16 +41,13 @@ def save_grippers(folder: Path, asked: Mapping[str, GripperConfig], found: Mappi
     """Write what was found for all hands, whose settings were ``asked``, into ``folder``; what was there is kept beside it. Its path.
 
     Raises:
-        InvalidSetting: if it cannot be written.
+        CannotWrite: there is no room, or no folder.
     """
     path = folder / FILE
     arms = {arm: {"settings": _picked(asked[arm], _ASKED), "found": _picked(found[arm], _FOUND)} for arm in ARMS}
     content = {"version": VERSION, "measured_unix_s": time.time(), "arms": arms}
-    try:
-        keep(path)
-        write_whole(path, json.dumps(content, indent=1) + "\n")
-    except OSError as error:
-        raise InvalidSetting("calibration", str(folder), f"a folder that can be written ({error.strerror or error})") from error
+    keep(path)
+    write_whole(path, json.dumps(content, indent=1) + "\n")
     return path
 
 

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.config import require_between
 from marl_handover.errors import CorruptFile, MissingFile
-from marl_handover.files import write_whole
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration
 from marl_handover.hardware.settings import ARMS
@@ -78,16 +77,15 @@ def half_bands_rad(half_us: Mapping[str, ArrayLike], calibrations: Sequence[ArmC
     return np.array([half_us[arm] for arm in ARMS], float) / scales
 
 
-def save_play(folder: Path, half_us: Mapping[str, ArrayLike], sd_us: Mapping[str, ArrayLike]) -> None:
-    """Write half the dead bands (5,) in us of each arm's servos, and their standard deviations (5,), into ``folder``."""
+def play_text(half_us: Mapping[str, ArrayLike], sd_us: Mapping[str, ArrayLike]) -> str:
+    """What the file holds: half the dead bands (5,) in us of each arm's servos, and their standard deviations (5,)."""
 
     def listed(values: Mapping[str, ArrayLike]) -> dict[str, dict[str, float]]:
         rows = {arm: np.round(np.asarray(values[arm], float), 3).tolist() for arm in ARMS}
         return {arm: dict(zip(ARM_JOINTS, row, strict=True)) for arm, row in rows.items()}
 
     content = {"version": VERSION, "half_band_us": listed(half_us), "half_band_sd_us": listed(sd_us)}
-    folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / FILE, json.dumps(content, indent=1) + "\n")
+    return json.dumps(content, indent=1) + "\n"
 
 
 def load_play(folder: Path) -> dict[str, Floats]:

@@ -10,13 +10,13 @@ happens to the folder or to its readers reaches the session. Files are replaced 
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import threading
 import time
 import uuid
 from collections import deque
+from contextlib import closing
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -25,13 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.files import temporary_of
+from marl_handover.files import GrowingFile, write_whole
 from marl_handover.hardware.errors import Stopped
 from marl_handover.perception.camera import Frame
 from marl_handover.perception.overlay import annotated, jpeg
 from marl_handover.perception.tracker import Seen
 from marl_handover.runtime.events import Event
-from marl_handover.runtime.feed import EVENTS_FILE, FORMAT, PICTURE_FILE, STATE_FILE, VERSION, Feed
+from marl_handover.runtime.feed import EVENTS_FILE, FORMAT, PICTURE_FILE, STATE_FILE, VERSION, Feed, require_own
 from marl_handover.runtime.steering import ControlFolder, Desk
 
 if TYPE_CHECKING:
@@ -141,12 +141,13 @@ class Publisher:
     def _prepare(self, folder: Path) -> None:
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            require_own(folder)
             other = Feed(folder).read()
             if other.live and other.state is not None and other.state["pid"] != os.getpid():
                 raise InvalidSetting("publish", str(folder), f"a folder of its own; process {other.state['pid']} publishes there")
             for name in (STATE_FILE, PICTURE_FILE, EVENTS_FILE):
                 (folder / name).unlink(missing_ok=True)
-            _replace(folder / EVENTS_FILE, b"")
+            _replace(folder / EVENTS_FILE, "")
         except OSError as error:
             raise InvalidSetting("publish", str(folder), f"a folder that can be written ({error.strerror or error})") from error
 
@@ -185,8 +186,8 @@ class Publisher:
             self._portrait.take(rows)
         lines = "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows if row["event"] != Event.STATE)
         if lines:
-            with (folder / EVENTS_FILE).open("a", encoding="utf-8") as stream:
-                stream.write(lines)
+            with closing(GrowingFile(folder / EVENTS_FILE)) as file:
+                file.write(lines)
 
     def _write_picture(self, folder: Path, last: bool) -> None:
         now_s, portrait = time.monotonic(), self._portrait
@@ -220,7 +221,7 @@ class Publisher:
             return
         self._number += 1
         about = {"number": self._number, "time": time.time(), "quiet_s": round(now_s - self._lively_s, 2), "over": last}
-        _replace(folder / STATE_FILE, json.dumps({**shown, **moment, **about}, allow_nan=False).encode())
+        _replace(folder / STATE_FILE, json.dumps({**shown, **moment, **about}, allow_nan=False))
         self._written, self._written_s = shown, now_s
 
 
@@ -235,13 +236,6 @@ def _ending(error: BaseException | None) -> tuple[str, str]:
     return "failed", str(error) or type(error).__name__
 
 
-def _replace(path: Path, content: bytes) -> None:
+def _replace(path: Path, content: str | bytes) -> None:
     """Write a file as a whole. Not flushed to the disk, as files are that have to outlive a loss of power: these tell of now."""
-    temporary = temporary_of(path)
-    try:
-        temporary.write_bytes(content)
-        temporary.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
+    write_whole(path, content, durable=False)

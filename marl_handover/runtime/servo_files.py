@@ -9,12 +9,12 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
-from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
-from marl_handover.files import keep, write_whole
+from marl_handover.errors import CorruptFile, MissingFile
+from marl_handover.files import keep, make_folder, write_together
 from marl_handover.hardware.calibration import ArmCalibration, CalibrationProblem
 from marl_handover.hardware.settings import ARMS
 from marl_handover.parsing import read_json
-from marl_handover.runtime.play import AGAIN, save_play
+from marl_handover.runtime.play import AGAIN, play_text
 from marl_handover.runtime.play import FILE as PLAY_FILE
 
 SET_FILE = "servos.json"
@@ -41,19 +41,15 @@ def save_servos(folder: Path, arms: Mapping[str, ArmCalibration], half_us: Mappi
         sd_us: their standard deviations (5,).
 
     Raises:
-        InvalidSetting: if they cannot be written.
+        CannotWrite: there is no room for them, and then those that were there stay.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        keep(folder / PLAY_FILE)
-        keep(folder / SET_FILE)
-        for arm in ARMS:
-            arms[arm].save(folder / arm_file(arm))
-        save_play(folder, half_us, sd_us)
-        content = {"version": VERSION, "sha256": {name: _digest(folder / name) for name in NAMES}}
-        write_whole(folder / SET_FILE, json.dumps(content, indent=1) + "\n")
-    except OSError as error:
-        raise InvalidSetting("calibration", str(folder), f"a folder that can be written ({error.strerror or error})") from error
+    make_folder(folder)
+    texts = {arm_file(arm): arms[arm].text() for arm in ARMS} | {PLAY_FILE: play_text(half_us, sd_us)}
+    digests = {name: hashlib.sha256(texts[name].encode()).hexdigest() for name in NAMES}
+    texts[SET_FILE] = json.dumps({"version": VERSION, "sha256": digests}, indent=1) + "\n"
+    for name in texts:
+        keep(folder / name)
+    write_together({folder / name: text for name, text in texts.items()})
 
 
 def require_one_set(folder: Path, names: Collection[str] = NAMES) -> None:

@@ -106,7 +106,7 @@ class Session:
     def play(self, start: ArrayLike, goals: Goals, seed: int = 0) -> Episode:
         """One episode; ``start`` (3,) is where somebody puts the twin's block; a real one lies where it lies.
 
-        Raises as the backend's ``reset`` and ``execute``, and :class:`NoGoal`.
+        Raises as the backend's ``reset`` and ``execute``, :class:`NoGoal`, and :class:`CannotWrite` of the log.
         """
         asked: list[Floats] = []
 
@@ -128,10 +128,17 @@ class Session:
         outcome = episode.outcome.name.lower()
         self.desk.goal = None  # the next episode has its own
         self.log.add(Event.ENDED, ended=episode.ended, outcome=outcome, transfers=len(episode.transfers), goal=episode.goal)
+        self.log.require_written()
         return episode
 
     def _hold(self) -> bool:
-        """Wait for as long as somebody wants no transfer to begin; whether anybody did. Raises :class:`Stopped`."""
+        """Wait for as long as somebody wants no transfer to begin; whether anybody did. The arms are parked.
+
+        Raises:
+            Stopped: the stop is latched.
+            CannotWrite: there is no room for the log.
+        """
+        self.log.require_written()
         self._answer()
         if not self.desk.paused:
             return False

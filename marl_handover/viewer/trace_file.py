@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,15 +11,14 @@ from numpy.typing import NDArray
 
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.envs.cycle_check import Refusal
-from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
-from marl_handover.files import read_bounded
+from marl_handover.errors import CorruptFile, InvalidSetting
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.parsing import LINES_BYTES, parse_json
+from marl_handover.parsing import read_rows
 from marl_handover.task.rules import Outcome
 
 Floats = NDArray[np.float64]
 
-WHAT = "trace"
+WHAT = "trace file"
 OUTCOMES = tuple(outcome.name.lower() for outcome in Outcome if outcome is not Outcome.NONE)
 
 
@@ -115,13 +113,11 @@ def read_trace(path: Path) -> Trace:
     Raises:
         MissingFile, CorruptFile: with the number of the line.
     """
-    if not path.is_file():
-        raise MissingFile("trace file", path)
     steps: list[Step] = []
     starts: list[int] = []
     names: list[int] = []
     cell, order, session = None, None, _Session()
-    for number, row in _rows(path):
+    for number, row in read_rows(path, WHAT):
         try:
             name = session.take(row) if "event" in row else int(row["episode"])
             if "event" in row and row["event"] == "session":
@@ -169,23 +165,6 @@ class _Session:
             return None
         t_s, joints, gripper = (np.array(column) for column in zip(*sent, strict=True))
         return Recorded(t_s - t_s[0], joints, gripper)
-
-
-def _rows(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    try:
-        lines = read_bounded(path, LINES_BYTES, WHAT).decode("utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise CorruptFile(WHAT, path, str(error)) from error
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        try:
-            row = parse_json(line, finite=False)
-        except ValueError as error:
-            raise CorruptFile(WHAT, path, f"line {number} is not JSON") from error
-        if not isinstance(row, dict):
-            raise CorruptFile(WHAT, path, f"line {number} is not an object in braces")
-        yield number, row
 
 
 def _step(row: dict[str, Any], recorded: Recorded | None) -> Step:

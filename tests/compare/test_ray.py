@@ -19,8 +19,8 @@ import cloudpickle
 import pytest
 
 from marl_handover.cli import main
+from marl_handover.cluster import ClusterUnavailable, _root_cause
 from marl_handover.compare.launch import Failure, fan_out
-from marl_handover.compare.ray_workers import ClusterUnavailable, _root_cause
 
 cluster_utils = pytest.importorskip("ray.cluster_utils", reason="ray is not installed (pip install 'marl_handover[ray]')")
 

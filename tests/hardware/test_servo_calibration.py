@@ -10,7 +10,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, UnknownChoice
+from marl_handover.errors import CannotWrite, CorruptFile, MissingFile, UnknownChoice
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import (
     CalibrationProblem,
@@ -130,7 +130,7 @@ def test_the_file_has_to_fit_the_arm(model, tmp_path):
         load_calibration(path, "left", model.arm)
     with pytest.raises(MissingFile, match="calibrate"):
         load_calibration(tmp_path / "none.json", "left", model.arm)
-    with pytest.raises(InvalidSetting, match="can be written"):
+    with pytest.raises(CannotWrite, match="left.json cannot be written"):
         measured_arm(model).save(path / "below")
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 import os
 import re
 import shlex
 import signal
+import threading
+import time
 import warnings
 from copy import deepcopy
 from pathlib import Path
@@ -14,10 +17,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from marl_handover.cluster import ClusterUnavailable
 from marl_handover.commands import train
 from marl_handover.compose import compose
 from marl_handover.config import MotionConfig, NoiseConfig
 from marl_handover.errors import HandoverError
+from marl_handover.learning import aec_experience
 from marl_handover.learning.aec_experience import AecExperience, WorkerLost
 from marl_handover.learning.aec_policy import WorkerPolicy, make_env, message
 from marl_handover.learning.experience import BatchedExperience
@@ -281,6 +286,56 @@ def check_workers(experience, learner):
     assert len(goals.unique(dim=0)) == len(goals), "workers have problems of their own"
     with pytest.raises(TypeError, match="not by"):
         experience.collect(lambda observation: observation)
+
+
+@pytest.fixture
+def worker(monkeypatch):
+    """A process that lives until it is killed."""
+    monkeypatch.setattr(aec_experience, "LOOK_S", 0.05)
+    monkeypatch.setattr(aec_experience, "GRACE_S", 0.2)
+    process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(600,), daemon=True)
+    process.start()
+    yield process
+    process.kill()
+    process.join()
+
+
+def test_what_never_comes_from_a_killed_worker_is_not_waited_for(worker):
+    threading.Timer(0.3, lambda: os.kill(worker.pid, signal.SIGKILL)).start()
+    with pytest.raises(ChildProcessError, match=f"process {worker.pid} ended with -9"):
+        aec_experience.watched(threading.Event().wait, lambda: [worker])
+
+
+def test_what_living_workers_bring_is_waited_for_and_their_errors_are_passed_on(worker):
+    brought = threading.Event()
+    threading.Timer(0.4, brought.set).start()
+    assert aec_experience.watched(brought.wait, lambda: [worker]) is True
+    with pytest.raises(ZeroDivisionError):
+        aec_experience.watched(lambda: 1 / 0, lambda: [worker])
+    worker.kill()
+    worker.join()
+    assert aec_experience.watched(lambda: "was under way", lambda: [worker]) == "was under way"
+
+
+def test_a_dead_ray_address_is_told_at_once_and_is_no_lost_worker(begin, monkeypatch):
+    pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    experience, learner = begin("collector=ray")
+    with pytest.raises(ClusterUnavailable, match="RAY_ADDRESS=127.0.0.1:1: Connection refused"):
+        experience.collect(learner.explore)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment_s", [0.0, 0.02, 0.05, 0.1, 0.3])
+def test_a_worker_killed_at_any_moment_ends_the_run(begin, moment_s):
+    experience, learner = begin("collector=multiprocess")
+    gather(experience, learner.blind, 1)
+    workers = experience._collector.procs
+    threading.Timer(moment_s, lambda: os.kill(workers[1].pid, signal.SIGKILL)).start()
+    with pytest.raises(WorkerLost, match="resume=RUN"):
+        gather(experience, learner.explore, 300)
+    experience.close()
+    assert not any(worker.is_alive() for worker in workers)
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ import torch
 
 from marl_handover.commands.train import resumed
 from marl_handover.errors import CheckpointMismatch, CorruptFile, MissingFile
+from marl_handover.files import remove_temporaries, temporary_of
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
 from marl_handover.learning.recorder import COLUMNS, Recorder
 from marl_handover.learning.trainer import Trainer
@@ -169,11 +170,14 @@ def test_another_format_and_another_architecture_do_not_match(small, started):
 def test_a_temporary_file_of_a_killed_process_is_harmless(started):
     state = load_checkpoint(started)
     before = state["config"]
-    (started / f"{FILE}.tmp").write_bytes(b"half a checkpo")
+    left = [temporary_of(started / FILE), started / f"{FILE}.tmp", started / "config.yaml.123.tmp"]  # the last two are of version 0.1
+    for path in left:
+        path.write_bytes(b"half a checkpo")
     assert load_checkpoint(started)["config"] == before
     save_checkpoint(started, {**state, "config": "new"})
     assert load_checkpoint(started)["config"] == "new"
-    assert not (started / f"{FILE}.tmp").exists()
+    remove_temporaries(started)
+    assert not any(path.exists() for path in left)
 
 
 def test_a_save_that_fails_leaves_the_old_checkpoint(started):

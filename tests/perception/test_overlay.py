@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import resource
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from marl_handover.errors import CorruptFile
 from marl_handover.perception.calibration import hung_camera
-from marl_handover.perception.overlay import Mark, annotated, jpeg, read_picture
+from marl_handover.perception.overlay import Mark, annotated, decoded, jpeg
 from marl_handover.perception.settings import MountConfig
 
 RED = "#FF0000"
@@ -59,10 +62,19 @@ def test_files_hold_what_was_put_in(tmp_path):
     image[:, 80:] = 30, 120, 220
     path = tmp_path / "picture.jpg"
     path.write_bytes(jpeg(image))
-    back = read_picture(path)
+    back = decoded(path.read_bytes(), path)
     assert back.dtype == np.uint8
-    np.testing.assert_allclose(back[45, 120], [220, 120, 30], atol=12)
+    np.testing.assert_allclose(back[45, 120], [30, 120, 220], atol=12)
     for content in (b"", b"nonsense"):
-        path.write_bytes(content)
         with pytest.raises(CorruptFile, match="JPEG"):
-            read_picture(path)
+            decoded(content, path)
+
+
+def test_a_small_file_that_would_be_a_large_picture_is_not_decoded(tmp_path):
+    Image.new("1", (30_000, 30_000)).save(tmp_path / "bomb.png")
+    content = (tmp_path / "bomb.png").read_bytes()
+    assert len(content) < 200_000
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(CorruptFile, match="30000 x 30000 pixels|JPEG or PNG"):
+        decoded(content, tmp_path / "bomb.png")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB

@@ -8,7 +8,7 @@ import sys
 import pytest
 from matplotlib.figure import Figure
 
-from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
+from marl_handover.errors import CannotWrite, CorruptFile, InvalidSetting, MissingFile
 from marl_handover.parsing import read_json
 from marl_handover.report.files import require_picture, save_figure, write_json
 
@@ -27,18 +27,18 @@ def test_other_suffixes_and_folders_are_refused(tmp_path):
     with pytest.raises(InvalidSetting, match="ends in .png, .pdf or .svg"):
         require_picture("out", "a.gif")
     (tmp_path / "a.png").mkdir()
-    with pytest.raises(InvalidSetting, match="can be written"):
+    with pytest.raises(CannotWrite, match=r"a\.png cannot be written: it is a folder"):
         save_figure(Figure(), tmp_path / "a.png")
     (tmp_path / "file").write_text("")
-    with pytest.raises(InvalidSetting, match="can be written"):
-        write_json(tmp_path / "file" / "a.json", {}, "json")
+    with pytest.raises(CannotWrite, match="file cannot be written"):
+        write_json(tmp_path / "file" / "a.json", {})
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.json"
-    write_json(path, {"a": 1}, "json")
+    write_json(path, {"a": 1})
     with pytest.raises(ValueError, match="JSON"):
-        write_json(path, {"a": float("nan")}, "json")
+        write_json(path, {"a": float("nan")})
     assert read_json(path, "plan") == {"a": 1}
     assert list(tmp_path.iterdir()) == [path]
 

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from marl_handover.errors import InvalidSetting
+from marl_handover.errors import CannotWrite
 from marl_handover.runtime.events import FAULTS, NOTES, Event, EventLog
 
 
@@ -33,8 +33,21 @@ def test_without_a_file_events_are_counted_and_shown_to_a_listener():
 
 
 def test_a_log_that_cannot_be_written_is_refused(tmp_path):
-    with pytest.raises(InvalidSetting, match="log"):
+    with pytest.raises(CannotWrite, match="nowhere/log cannot be written"):
         EventLog(lambda: 0.0, str(tmp_path / "nowhere" / "log"))
+
+
+def test_a_full_disk_interrupts_nothing_and_is_told_when_asked():
+    shown = []
+    log = EventLog(lambda: 0.0, "/dev/full", shown.append)
+    log.require_written()
+    log.add(Event.SEEN)
+    log.add(Event.DROPPED, arm=1)
+    assert len(shown) == 2
+    assert log.counts.total() == 2
+    with pytest.raises(CannotWrite, match="/dev/full cannot be written: No space"):
+        log.require_written()
+    log.close()
 
 
 def test_every_event_is_a_note_or_a_fault():

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.roll import Roll
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.perception.overlay import jpeg
 from marl_handover.runtime.feed import EVENTS_FILE, FORMAT, PICTURE_FILE, SILENT_S, STATE_FILE, VERSION, Feed, NotSteerable
@@ -217,6 +218,10 @@ def test_a_latch_that_cannot_be_written_interrupts_the_session(tmp_path):
     (tmp_path / "file").write_text("")
     put(tmp_path, state(pid=process.pid, stop_file=str(tmp_path / "file" / "stop")))
     feed = Feed(tmp_path)
+    assert "CUT THE POWER" in feed.stop("page"), "a process that has not signed up as a session is none"
+    Roll().folder.mkdir(exist_ok=True)
+    signed = Roll().folder / f"{process.pid}-0.json"
+    signed.write_text(json.dumps({"pid": process.pid, "stop_file": str(tmp_path / "file" / "stop")}))
     assert f"interrupted process {process.pid}" in feed.stop("page")
     assert process.communicate(timeout=30)[0] == "halted\n"
     assert "CUT THE POWER" in feed.stop("page"), "nobody is left to be interrupted"
@@ -231,3 +236,70 @@ def test_nobody_is_interrupted_who_is_not_surely_the_session(tmp_path, monkeypat
     put(tmp_path, state(stop_file=str(tmp_path / "file" / "stop")) | where)
     assert "CUT THE POWER" in Feed(tmp_path).stop("page")
     assert signals == []
+
+
+def test_stop_replaces_no_file_that_is_no_stop_file(tmp_path):
+    mine = tmp_path / "thesis.tex"
+    mine.write_text("years of work")
+    put(tmp_path, state(stop_file=str(mine)))
+    assert "is no stop file" in (said := Feed(tmp_path).stop("page"))
+    assert "CUT THE POWER" in said
+    assert mine.read_text() == "years of work"
+    os.mkfifo(tmp_path / "fifo")
+    put(tmp_path, state(stop_file=str(tmp_path / "fifo")))
+    assert "is no stop file" in Feed(tmp_path).stop("page"), "and a FIFO is not waited for"
+    put(tmp_path, state(stop_file=str(tmp_path / "stop")))
+    for reason in ("first", "second"):
+        assert "stop latched" in Feed(tmp_path).stop(reason)
+        assert StopLatch(tmp_path / "stop").reason() == reason
+
+
+def test_what_a_session_signed_up_with_counts_more_than_what_its_folder_says(tmp_path):
+    Roll().folder.mkdir(exist_ok=True)
+    signed = Roll().folder / f"{os.getpid()}-feed.json"
+    signed.write_text(json.dumps({"pid": os.getpid(), "stop_file": str(tmp_path / "true")}))
+    try:
+        put(tmp_path, state(stop_file=str(tmp_path / "false")))
+        assert str(tmp_path / "true") in Feed(tmp_path).stop("page")
+        assert not (tmp_path / "false").exists()
+    finally:
+        signed.unlink()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root gives files away")
+def test_a_strangers_folder_and_his_files_in_ones_own_are_not_believed(tmp_path):
+    put(tmp_path, state(stop_file=str(tmp_path / "stop")))
+    (tmp_path / PICTURE_FILE).write_bytes(jpeg(np.zeros((36, 64, 3), np.uint8)))
+    (tmp_path / EVENTS_FILE).write_text('{"event": "a"}\n')
+    for name in (STATE_FILE, PICTURE_FILE, EVENTS_FILE, ""):
+        os.chown(tmp_path / name, 12345, 12345)
+        feed = Feed(tmp_path)
+        assert (feed.read().state is None) == (name in (STATE_FILE, ""))
+        assert (feed.picture() is None) == (name == PICTURE_FILE)
+        assert (feed.events() == []) == (name == EVENTS_FILE)
+        if name in (STATE_FILE, ""):
+            assert "another user (12345)" in feed.read().problem
+        feed.latch = lambda: StopLatch(tmp_path / "default")
+        feed.stop("page")
+        assert not (tmp_path / "stop").exists()
+        os.chown(tmp_path / name, 0, 0)
+
+
+@pytest.mark.parametrize("name", [STATE_FILE, PICTURE_FILE, EVENTS_FILE])
+@pytest.mark.parametrize("kind", ["fifo", "folder", "link", "large"])
+def test_what_is_no_small_file_of_its_own_is_not_read_nor_waited_for(tmp_path, name, kind):
+    put(tmp_path, state())
+    (tmp_path / name).unlink(missing_ok=True)
+    if kind == "fifo":
+        os.mkfifo(tmp_path / name)
+    elif kind == "folder":
+        (tmp_path / name).mkdir()
+    elif kind == "link":
+        (tmp_path / name).symlink_to("/proc/self/environ")
+    else:
+        with (tmp_path / name).open("wb") as stream:
+            stream.truncate(10**13)
+    feed = Feed(tmp_path)
+    assert (feed.read().state is None) == (name == STATE_FILE)
+    assert feed.picture() is None
+    assert feed.events() == [] or kind == "large"

@@ -13,7 +13,7 @@ from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
 from marl_handover.hardware.calibration import nominal_calibration
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.motion.trajectory import Phase
-from marl_handover.runtime.play import FILE, Play, half_bands_rad, load_play, save_play
+from marl_handover.runtime.play import FILE, Play, half_bands_rad, load_play, play_text
 
 HALF = np.radians([[0.4, 0.5, 0.3, 0.4, 0.6], [0.2, 0.2, 0.2, 0.2, 0.2]])
 WIDE = np.full(5, 10.0)
@@ -81,7 +81,8 @@ def test_file_round_trip_and_what_may_be_wrong_with_it(tmp_path):
     with pytest.raises(MissingFile, match="calibrate"):
         load_play(tmp_path)
     half, sure = {"left": [3.9, 1.0, 2.0, 6.5, 4.0], "right": np.arange(5.0)}, {"left": np.ones(5), "right": np.full(5, 0.3)}
-    save_play(tmp_path / "new", half, sure)
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / FILE).write_text(play_text(half, sure))
     found = load_play(tmp_path / "new")
     for arm, bands in half.items():
         np.testing.assert_allclose(found[arm], bands)
