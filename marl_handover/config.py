@@ -77,6 +77,21 @@ class BlockConfig:
     pin_top_mm: float = bounded(65.0, 5.0, 400.0)
     marker_mm: float = bounded(30.0, 4.0, 200.0)
 
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` on a value out of its limits, or parts that do not fit each other."""
+        check_bounds(self, "cell.block.")
+        fits = {
+            "pin_top_mm": (
+                self.pin_top_mm > self.height_mm,
+                f"above cell.block.height_mm = {self.height_mm:g}: it stands on the block",
+            ),
+            "pin_diameter_mm": (self.pin_diameter_mm < self.side_mm, f"below cell.block.side_mm = {self.side_mm:g}"),
+            "marker_mm": (self.marker_mm <= self.side_mm, f"up to cell.block.side_mm = {self.side_mm:g}: the marker lies on the block"),
+        }
+        for name, (fit, limit) in fits.items():
+            if not fit:
+                raise InvalidSetting(f"cell.block.{name}", getattr(self, name), limit)
+
 
 def _paper_limits() -> dict[str, list[float]]:
     """Joint limits for which the 5 mm grid fits the paper's annulus: the elbow's upper stop gives r_max, the wrist's r_min."""
@@ -103,6 +118,21 @@ class CellConfig:
     fit_rounding_mm: float = bounded(1.0, 0.0, 100.0)  # fitted radii are rounded inwards to a multiple of this; 0 keeps them
     chart_inset: float = bounded(1.0, 0.1, 1.0)  # part of the chart that is used: 1 = all, 0.95 leaves room for placement noise
     block: BlockConfig = field(default_factory=BlockConfig)
+
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` on a value out of its limits, or parts that do not fit each other."""
+        check_bounds(self, "cell.")
+        self.block.validate()
+
+    def require_grip(self, finger_travel_mm: float) -> None:
+        """Raise :class:`InvalidSetting` if hands that open so far cannot close on the pin; for whatever carries the block."""
+        low, high = self.block.height_mm, self.block.pin_top_mm
+        if not low < self.pick_height_mm < high:
+            limit = f"between cell.block.height_mm = {low:g} and cell.block.pin_top_mm = {high:g}: the hand closes on the pin"
+            raise InvalidSetting("cell.pick_height_mm", self.pick_height_mm, limit)
+        if self.block.pin_diameter_mm >= 2 * finger_travel_mm:
+            limit = f"above {self.block.pin_diameter_mm / 2:g}, half of cell.block.pin_diameter_mm: fingers have to pass the pin"
+            raise InvalidSetting("motion.finger_travel_mm", finger_travel_mm, limit)
 
 
 @dataclass

@@ -9,7 +9,7 @@ from marl_handover.cell.cell import Cell, mirrored_pair
 from marl_handover.cell.chart import Chart
 from marl_handover.cell.spaces import AnnulusFit, ManipulationGrid, fit_annulus, manipulation_grid
 from marl_handover.compose import from_yaml, to_yaml
-from marl_handover.config import CellConfig, check_bounds, require_choice
+from marl_handover.config import CellConfig, require_choice
 from marl_handover.errors import MissingFile
 from marl_handover.files import expanded
 from marl_handover.geometry.closed_form import ClosedFormArm
@@ -43,7 +43,7 @@ def build_cell(config: CellConfig) -> CellModel:
     Raises:
         InvalidSetting, MissingFile, UrdfError, NoSharedSpace: where a setting, the URDF or the geometry cannot be.
     """
-    check_bounds(config, "cell.")
+    config.validate()
     arm = ClosedFormArm(read_urdf(urdf_path(config.urdf), config.grasp_link), config.joint_limits_deg)
     bases = mirrored_pair(config.base_distance_mm)
     grid = manipulation_grid(arm, config, bases)

@@ -27,7 +27,7 @@ from marl_handover.hardware.gate import JointCommand
 from marl_handover.hardware.held import Pulses, all_held, middles, none_held
 from marl_handover.hardware.latch import StopLatch
 from marl_handover.hardware.moving import MovingSession, Sent
-from marl_handover.hardware.session import State
+from marl_handover.hardware.session import GATE_OFF, State
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 
 _RESTATED_S = 0.2
@@ -179,9 +179,10 @@ class ArmDriver(MovingSession):
             raise NotConfirmed()
 
     def _warning(self) -> str:
-        """Of arms that nobody has calibrated."""
+        """Of arms that nobody has calibrated, and of a gate that is off."""
+        off = "" if self.config.gate.enabled else f" {GATE_OFF}."
         nominal = [calibration.arm for calibration in self.calibrations if calibration.measured_unix_s == 0.0]
-        return _NOMINAL.format(" and ".join(nominal)) if nominal else ""
+        return off + (_NOMINAL.format(" and ".join(nominal)) if nominal else "")
 
     def _jump(self, commands: Sequence[JointCommand]) -> Sent:
         """The first move of boards that know no position: they jump, whatever time they are given."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import logging
 import threading
 from collections.abc import Iterator
 
@@ -19,6 +20,12 @@ from marl_handover.hardware.latch import StopLatch
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.hardware.signals import Endings, deferred
 from marl_handover.hardware.wiring import Wiring
+
+LOG = logging.getLogger(__name__)
+GATE_OFF = (
+    "WARNING: THE SAFETY GATE IS OFF (hardware.gate.enabled=false): nothing keeps the arms from their limits, the table, themselves and "
+    "each other"
+)
 
 _RETRY_S = 0.2
 
@@ -52,7 +59,9 @@ class BoardSession:
         dry_run: bool = False,
     ) -> None:
         config.validate()
+        config.require_grip(model.cell.config.block.pin_diameter_mm)
         self.config, self.model, self.motion = config, model, motion or MotionConfig()
+        model.cell.config.require_grip(self.motion.finger_travel_mm)
         self.clock: Clock = clock or RealClock()
         self.latch = latch or StopLatch(config.stop_path())
         self.dry_run, self.state = dry_run, State.DISCONNECTED
@@ -94,9 +103,11 @@ class BoardSession:
         self.state = State.CONNECTED
 
     def configure(self) -> None:
-        """Load the calibrations. Raises as :func:`load_calibration`."""
+        """Load the calibrations; warn of a gate that is off. Raises as :func:`load_calibration`."""
         if self.state is State.DISCONNECTED:
             raise WrongState("configure", self.state, State.CONNECTED)
+        if not self.config.gate.enabled:
+            LOG.warning(GATE_OFF)
         self.calibrations = calibrations(self.config, self.model.arm)
         self._gate = SafetyGate(self.model, self.config, self.calibrations)
         pin_mm = self.model.cell.config.block.pin_diameter_mm

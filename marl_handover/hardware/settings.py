@@ -6,12 +6,11 @@ and what the emulated servos are like.
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from dataclasses import dataclass, field
 
-from marl_handover.config import name_field, require_at_least, require_between, require_choice, require_positive
+from marl_handover.config import bounded, check_bounds, chosen, name_field, path_field, seed_field
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.protocol import BAUDS, CHANNELS, PULSE_US
@@ -41,11 +40,11 @@ class BoardConfig:
 class GripperConfig:
     """The gripper is closed by position: to the pin and a little further, never to its end, which strips the servo's gears."""
 
-    channel: int = 4
-    open_us: int = 1000  # pulse at open_mm
-    closed_us: int = 1900  # pulse at 0 mm
-    open_mm: float = 14.0  # how far each finger is from closed there
-    preload_mm: float = 0.6  # how far into the pin each finger is sent; the servo's softness makes it a force
+    channel: int = bounded(4, 0, CHANNELS - 1)
+    open_us: int = bounded(1000, *PULSE_US)  # pulse at open_mm
+    closed_us: int = bounded(1900, *PULSE_US)  # pulse at 0 mm
+    open_mm: float = bounded(14.0, 1.0, 50.0)  # how far each finger is from closed there
+    preload_mm: float = bounded(0.6, 0.0, 3.0)  # how far into the pin each finger is sent; the servo's softness makes it a force
 
 
 @dataclass
@@ -56,15 +55,15 @@ class ArmWiring:
     channels: list[int] = field(default_factory=lambda: [0, 1, 2, 3, 5])  # of base_yaw, shoulder, elbow, wrist_pitch, wrist_roll
     gripper: GripperConfig = field(default_factory=GripperConfig)
     pulse_limits_us: list[list[int]] = field(default_factory=lambda: [list(PULSE_US) for _ in ARM_JOINTS])  # [lower, upper] of each joint
-    calibration: str = ""  # file of calibrate servos; empty: nominal values, good enough to test directions, not to grasp
+    calibration: str = path_field()  # file of calibrate servos; empty: nominal values, good enough to test directions, not to grasp
 
 
 @dataclass
 class ServoNominal:
     """A servo before calibration: pulse at the joint's zero, and the change with the angle, negative where it turns the other way."""
 
-    zero_us: float = 1500.0
-    us_per_deg: float = 9.5
+    zero_us: float = bounded(1500.0, -5000.0, 8000.0)
+    us_per_deg: float = bounded(9.5, -16.0, 16.0)
 
 
 def _nominal() -> dict[str, ServoNominal]:
@@ -83,56 +82,54 @@ class GateConfig:
     """What the safety gate between plan and wire lets through. Planned motions keep more clearance (``motion.*``) than this."""
 
     enabled: bool = True
-    speed_share: float = 1.0  # of the URDF's joint velocities; plans use motion.velocity_share of them
-    step_deg: float = 20.0  # greatest change of a joint in one command
-    table_clearance_mm: float = 0.5  # of every link after the turret
-    arm_clearance_mm: float = 3.0
-    self_clearance_mm: float = 0.0
-    stale_s: float = 0.25  # a command older than this is not sent
-    finger_mm: float = 16.0  # greatest opening of each finger
-    finger_mm_s: float = 95.0  # greatest speed of each finger
+    speed_share: float = bounded(1.0, 0.01, 1.0)  # of the URDF's joint velocities; plans use motion.velocity_share of them
+    step_deg: float = bounded(20.0, 0.1, 90.0)  # greatest change of a joint in one command
+    table_clearance_mm: float = bounded(0.5, 0.0, 50.0)  # of every link after the turret
+    arm_clearance_mm: float = bounded(3.0, 0.0, 100.0)
+    self_clearance_mm: float = bounded(0.0, 0.0, 50.0)
+    stale_s: float = bounded(0.25, 0.02, 2.0)  # a command older than this is not sent
+    finger_mm: float = bounded(16.0, 1.0, 50.0)  # greatest opening of each finger
+    finger_mm_s: float = bounded(95.0, 1.0, 500.0)  # greatest speed of each finger
 
 
 @dataclass
 class StreamConfig:
     """How a motion is sent."""
 
-    period_s: float = 0.06  # between group moves; the boards act every 20 ms, so a multiple of that
-    poll_s: float = 0.004  # how often the stop is looked at while waiting
-    backlog_s: float = 0.002  # a move is not written before what is still on the way takes less than this
-    late_s: float = 0.3  # watchdog: a motion that falls behind by more is given up
-    settle_s: float = 0.3  # after the last move, for the servos to arrive
+    period_s: float = bounded(0.06, 0.02, 0.2)  # between group moves; the boards act every 20 ms, so a multiple of that
+    poll_s: float = bounded(0.004, 1e-4, 0.01)  # how often the stop is looked at while waiting
+    backlog_s: float = bounded(0.002, 0.0, 0.01)  # a move is not written before what is still on the way takes less than this
+    late_s: float = bounded(0.3, 0.02, 2.0)  # watchdog: a motion that falls behind by more is given up
+    settle_s: float = bounded(0.3, 0.0, 5.0)  # after the last move, for the servos to arrive
     check_reset: bool = True  # ask for all pulses before each group move: none means a reset; another than sent, a board that disobeys
-    pulse_tolerance_us: float = 15.0  # a pulse may be told so far from what was sent: a servo's dead band is as wide
+    pulse_tolerance_us: float = bounded(15.0, 5.0, 200.0)  # a pulse may be told so far from what was sent: a servo's dead band is as wide
 
 
 @dataclass
 class TimeoutConfig:
     """Limits of waiting, in s. None is without one: an unpowered board answers never."""
 
-    reply_s: float = 0.1  # above FTDI's 16 ms latency and a board's slowest answer
-    write_s: float = 0.5
-    reconnect_s: float = 10.0  # how long reconnect() waits for a port to come back
-    retries: int = 2  # of a query that was answered badly
+    reply_s: float = bounded(0.1, 0.005, 2.0)  # above FTDI's 16 ms latency and a board's slowest answer
+    write_s: float = bounded(0.5, 0.01, 5.0)
+    reconnect_s: float = bounded(10.0, 0.1, 600.0)  # how long reconnect() waits for a port to come back
+    retries: int = bounded(2, 0, 20)  # of a query that was answered badly
 
 
 @dataclass
 class EmulatorConfig:
     """Emulated servos: what they are like, and by how much each differs from the nominal one. Errors are drawn from ``seed``."""
 
-    seed: int = 0
-    scale_sd: float = 0.02  # relative, of us per degree; cut at two standard deviations, as the offset is
-    offset_sd_us: float = 15.0
-    dead_band_us: float = 8.0  # full width; a HS-755HB's
-    dead_band_sd_us: float = 3.0  # from servo to servo; cut at two standard deviations, as the others are
-    lag_s: float = 0.03
-    settle_sd_us: float = 1.0  # where a servo comes to rest, drawn anew at each stop
-    speed_deg_s: list[float] = field(
-        default_factory=lambda: [333.0, 261.0, 261.0, 300.0, 545.0, 545.0]
-    )  # at 6 V; the last is the gripper's
-    end_stop_deg: float = 5.0  # how far beyond the URDF's limits the end stops are
+    seed: int = seed_field()
+    scale_sd: float = bounded(0.02, 0.0, 0.2)  # relative, of us per degree; cut at two standard deviations, as the offset is
+    offset_sd_us: float = bounded(15.0, 0.0, 200.0)
+    dead_band_us: float = bounded(8.0, 0.0, 100.0)  # full width; a HS-755HB's
+    dead_band_sd_us: float = bounded(3.0, 0.0, 50.0)  # from servo to servo; cut at two standard deviations, as the others are
+    lag_s: float = bounded(0.03, 1e-4, 1.0)
+    settle_sd_us: float = bounded(1.0, 0.0, 50.0)  # where a servo comes to rest, drawn anew at each stop
+    speed_deg_s: list[float] = bounded([333.0, 261.0, 261.0, 300.0, 545.0, 545.0], 1.0, 5000.0)  # at 6 V; the last is the gripper's
+    end_stop_deg: float = bounded(5.0, 0.0, 90.0)  # how far beyond the URDF's limits the end stops are
     firmware: str = "SSC32-V2.50USB"
-    boot_s: float = 0.2
+    boot_s: float = bounded(0.2, 0.0, 30.0)
 
 
 @dataclass
@@ -149,18 +146,15 @@ class HardwareConfig:
     stream: StreamConfig = field(default_factory=StreamConfig)
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     emulator: EmulatorConfig = field(default_factory=EmulatorConfig)
-    first_move: str = "ask"  # ask somebody to confirm the parked pose, or refuse to move a board that has no reference
-    on_disconnect: str = "hold"  # hold (servos stay on), limp (arms sink), park (drive there, then hold)
-    park_deg_s: float = 30.0  # speed on the way to the parked pose
+    first_move: str = chosen("ask", FIRST_MOVES)  # ask somebody to confirm the parked pose, or refuse to move a board that has no reference
+    on_disconnect: str = chosen("hold", ON_DISCONNECT)  # hold (servos stay on), limp (arms sink), park (drive there, then hold)
+    park_deg_s: float = bounded(30.0, 1.0, MAX_PARK_DEG_S)  # speed on the way to the parked pose
     stop_file: str = ""  # the latched stop, an absolute path; empty: this user's, /tmp/marl-handover-UID.stop, or .twin.stop
-    log_entries: int = 20_000  # of the log of every byte; older ones are dropped
+    log_entries: int = bounded(20_000, 1, 1_000_000)  # of the log of every byte; older ones are dropped
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits, or wiring that cannot be."""
-        require_choice("hardware.first_move", self.first_move, FIRST_MOVES)
-        require_choice("hardware.on_disconnect", self.on_disconnect, ON_DISCONNECT)
-        require_between("hardware.park_deg_s", self.park_deg_s, 1, MAX_PARK_DEG_S)
-        require_at_least("hardware.log_entries", self.log_entries, 1)
+        check_bounds(self, "hardware.")
         if self.stop_file and not os.path.isabs(self.stop_file):
             raise InvalidSetting("hardware.stop_file", self.stop_file, "an absolute path: every shell has to find the same file")
         if set(self.arms) != set(ARMS):
@@ -176,50 +170,31 @@ class HardwareConfig:
             taken = [channel for arm in ARMS if self.arms[arm].board == name for channel in self.channels(arm)]
             if len(set(taken)) != len(taken):
                 raise InvalidSetting(f"channels of board {name}", taken, "each used once")
-        self._check_numbers()
+        emulator = self.emulator
+        if len(emulator.speed_deg_s) != len(ARM_JOINTS) + 1:
+            raise InvalidSetting("hardware.emulator.speed_deg_s", emulator.speed_deg_s, f"{len(ARM_JOINTS) + 1} speeds")
+        if not re.search(r"SSC32-V\d+\.\d+", emulator.firmware):
+            raise InvalidSetting("hardware.emulator.firmware", emulator.firmware, "SSC32-V and a number, such as SSC32-V2.50USB")
+
+    def require_grip(self, pin_diameter_mm: float) -> None:
+        """Raise :class:`InvalidSetting` for fingers that would close to their end, whatever is between them: that strips gears."""
+        for name in ARMS:
+            preload_mm = self.arms[name].gripper.preload_mm
+            if preload_mm >= pin_diameter_mm / 2:
+                limit = f"below {pin_diameter_mm / 2:g}, half of cell.block.pin_diameter_mm: fingers never close to their end"
+                raise InvalidSetting(f"hardware.arms.{name}.gripper.preload_mm", preload_mm, limit)
 
     def _check_arm(self, name: str, arm: ArmWiring) -> None:
         if arm.board not in self.boards:
             raise InvalidSetting(f"{name}.board", arm.board, f"one of hardware.boards: {', '.join(self.boards)}")
-        if len(arm.channels) != len(ARM_JOINTS) or not all(0 <= channel < CHANNELS for channel in [*arm.channels, arm.gripper.channel]):
+        if len(arm.channels) != len(ARM_JOINTS) or not all(0 <= channel < CHANNELS for channel in arm.channels):
             raise InvalidSetting(f"{name}.channels", arm.channels, f"{len(ARM_JOINTS)} channels, each 0 to {CHANNELS - 1}")
         limits = arm.pulse_limits_us
         if len(limits) != len(ARM_JOINTS) or not all(len(pair) == 2 and PULSE_US[0] <= pair[0] < pair[1] <= PULSE_US[1] for pair in limits):
             raise InvalidSetting(f"{name}.pulse_limits_us", limits, f"a pair [lower, upper] a joint, within {PULSE_US[0]} to {PULSE_US[1]}")
         gripper = arm.gripper
-        for end in ("open_us", "closed_us"):
-            require_between(f"{name}.gripper.{end}", getattr(gripper, end), *PULSE_US)
         if gripper.open_us == gripper.closed_us:
             raise InvalidSetting(f"{name}.gripper.open_us", gripper.open_us, "another pulse than closed_us")
-        require_positive(f"{name}.gripper.open_mm", gripper.open_mm)
-        require_between(f"{name}.gripper.preload_mm", gripper.preload_mm, 0, 3)
-
-    def _check_numbers(self) -> None:
-        gate, stream, times = self.gate, self.stream, self.timeouts
-        require_between("hardware.gate.speed_share", gate.speed_share, 0.01, 1)
-        require_between("hardware.gate.step_deg", gate.step_deg, 0.1, 90)
-        for name in ("table_clearance_mm", "arm_clearance_mm", "self_clearance_mm"):
-            require_at_least(f"hardware.gate.{name}", getattr(gate, name), 0)
-        for name in ("stale_s", "finger_mm", "finger_mm_s"):
-            require_positive(f"hardware.gate.{name}", getattr(gate, name))
-        require_between("hardware.stream.period_s", stream.period_s, 0.02, 0.2)
-        require_between("hardware.stream.poll_s", stream.poll_s, 1e-4, 0.01)
-        require_between("hardware.stream.backlog_s", stream.backlog_s, 0, 0.01)
-        require_positive("hardware.stream.late_s", stream.late_s)
-        require_at_least("hardware.stream.settle_s", stream.settle_s, 0)
-        require_between("hardware.stream.pulse_tolerance_us", stream.pulse_tolerance_us, 5, 200)
-        for name in ("reply_s", "write_s", "reconnect_s"):
-            require_positive(f"hardware.timeouts.{name}", getattr(times, name))
-        require_at_least("hardware.timeouts.retries", times.retries, 0)
-        emulator = self.emulator
-        for name in ("offset_sd_us", "dead_band_us", "dead_band_sd_us", "settle_sd_us", "end_stop_deg", "boot_s"):
-            require_at_least(f"hardware.emulator.{name}", getattr(emulator, name), 0)
-        if not re.search(r"SSC32-V\d+\.\d+", emulator.firmware):
-            raise InvalidSetting("hardware.emulator.firmware", emulator.firmware, "SSC32-V and a number, such as SSC32-V2.50USB")
-        require_between("hardware.emulator.scale_sd", emulator.scale_sd, 0, 0.2)
-        require_between("hardware.emulator.lag_s", emulator.lag_s, 1e-4, 1)
-        if len(emulator.speed_deg_s) != len(ARM_JOINTS) + 1 or not all(math.isfinite(v) and v > 0 for v in emulator.speed_deg_s):
-            raise InvalidSetting("hardware.emulator.speed_deg_s", emulator.speed_deg_s, f"{len(ARM_JOINTS) + 1} speeds above 0")
 
     def used_boards(self) -> tuple[str, ...]:
         """Names of the boards that an arm is wired to, in the order of the arms."""

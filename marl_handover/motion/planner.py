@@ -47,6 +47,7 @@ class MotionPlanner:
     def __init__(self, model: CellModel, motion: MotionConfig | None = None) -> None:
         self.model, self.motion = model, motion or MotionConfig()
         self.motion.validate()
+        model.cell.config.require_grip(self.motion.finger_travel_mm)
         self.home_rad = np.radians(np.asarray(self.motion.parked_deg, float))
         if not model.arm.within_limits(self.home_rad):
             raise InvalidSetting("motion.parked_deg", self.motion.parked_deg, "angles within the joint limits")

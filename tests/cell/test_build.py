@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from marl_handover.cell import build_cell, cell_config, load_cell
-from marl_handover.config import CellConfig
+from marl_handover.cli import main
+from marl_handover.config import BlockConfig, CellConfig, MotionConfig
 from marl_handover.errors import CorruptFile, HandoverError, InvalidSetting, MissingFile, NoSharedSpace, UnknownChoice
 
 PAPER = cell_config("paper")
@@ -43,6 +44,63 @@ def test_bad_numbers_are_named(name, value):
         build_cell(replace(PAPER, **{name: value}))
     assert caught.value.exit_status == 2
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("block", "name"),
+    [({name: value}, name) for name in asdict(BlockConfig()) for value in (math.nan, math.inf, 0.0, -5.0, 1e6)]
+    + [
+        ({"pin_top_mm": 15.0}, "pin_top_mm"),
+        ({"height_mm": 70.0}, "pin_top_mm"),
+        ({"marker_mm": 41.0}, "marker_mm"),
+        ({"side_mm": 20.0}, "marker_mm"),
+        ({"side_mm": 8.0, "marker_mm": 8.0, "pin_diameter_mm": 8.0}, "pin_diameter_mm"),
+    ],
+)
+def test_a_block_that_cannot_be_is_named(block, name):
+    with pytest.raises(InvalidSetting, match=rf"cell\.block\.{name} = "):
+        build_cell(replace(PAPER, block=BlockConfig(**block)))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["workspace"],
+        ["plan", "start=[0,20,0]", "goal=[0,40,30]"],
+        ["train", "steps=64"],
+        ["evaluate", "policy=exact", "episodes=1"],
+        ["simulate", "episodes=1"],
+        ["calibrate", "hardware=twin", "what=sheets"],
+        ["run", "hardware=twin", "policy=exact"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_every_command_that_reads_a_cell_refuses_it(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([*command, "cell.block.pin_top_mm=10"]) == 2
+    told = capsys.readouterr().err
+    assert "cell.block.pin_top_mm = 10.0: must be above cell.block.height_mm = 15" in told
+    assert told.count("\n") == 1
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [({"pick_height_mm": 70.0}, "cell.pick_height_mm"), ({"pick_height_mm": 10.0}, "cell.pick_height_mm"), ({}, "motion.finger_travel_mm")],
+)
+def test_hands_close_on_the_pin_wherever_a_block_is_carried(changes, name):
+    """A cell alone may be looked at with any pick height; its reach is a matter of the arms."""
+    from marl_handover.motion.planner import MotionPlanner
+    from marl_handover.simulation.world import BulletCell
+
+    model = build_cell(PAPER)
+    pin = {"block": BlockConfig(pin_diameter_mm=20.0)} if not changes else {}
+    other = model._replace(cell=replace(model.cell, config=replace(PAPER, **changes, **pin)))
+    motion = MotionConfig(finger_travel_mm=9.0)
+    for made in (MotionPlanner, BulletCell):
+        with pytest.raises(InvalidSetting) as caught:
+            made(other, motion)
+        assert caught.value.name == name
 
 
 @pytest.mark.parametrize("distance_mm", [200.0, 300.0, 460.0, 900.0])

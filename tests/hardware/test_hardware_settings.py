@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 
 import numpy as np
 import pytest
 import yaml
 
+from marl_handover.bounds import bounds_of
 from marl_handover.commands import emulate
 from marl_handover.compose import compose, from_text, to_yaml
+from marl_handover.config import BlockConfig
 from marl_handover.errors import HandoverError, InvalidSetting, UnknownChoice
 from marl_handover.hardware.calibration import nominal_calibration
 from marl_handover.hardware.clock import VirtualClock
+from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.errors import PortNotFound
 from marl_handover.hardware.gate import JointCommand
 from marl_handover.hardware.ports import choose_port, list_serial_ports
@@ -64,6 +67,14 @@ def test_a_second_board_is_two_settings():
         ("hardware.gate.table_clearance_mm=-1", "hardware.gate.table_clearance_mm"),
         ("hardware.timeouts.reply_s=0", "hardware.timeouts.reply_s"),
         ("hardware.emulator.firmware=LSS", "hardware.emulator.firmware"),
+        ("hardware.gate.finger_mm_s=1e300", "hardware.gate.finger_mm_s"),
+        ("hardware.gate.stale_s=1e9", "hardware.gate.stale_s"),
+        ("hardware.stream.settle_s=1e12", "hardware.stream.settle_s"),
+        ("hardware.stream.late_s=inf", "hardware.stream.late_s"),
+        ("hardware.timeouts.reply_s=1e6", "hardware.timeouts.reply_s"),
+        ("hardware.timeouts.retries=1000000", "hardware.timeouts.retries"),
+        ("hardware.nominal.elbow.us_per_deg=nan", "hardware.nominal.elbow.us_per_deg"),
+        ("hardware.log_entries=1000000000000", "hardware.log_entries"),
         ("hardware.emulator.speed_deg_s=[1.0]", "hardware.emulator.speed_deg_s"),
     ],
 )
@@ -71,6 +82,29 @@ def test_wiring_that_cannot_be_is_named(change, name):
     with pytest.raises(InvalidSetting) as caught:
         compose(Command, [change]).hardware.validate()
     assert caught.value.name == name
+
+
+def numbers(settings, prefix=""):
+    """Every field of a settings class that is a number, or a list of them, with its key."""
+    for item in fields(settings):
+        value = getattr(settings, item.name)
+        if is_dataclass(value):
+            yield from numbers(value, f"{prefix}{item.name}.")
+        elif isinstance(value, dict):
+            for key, each in value.items():
+                yield from numbers(each, f"{prefix}{item.name}.{key}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield f"{prefix}{item.name}", item
+
+
+@pytest.mark.parametrize(("key", "item"), list(numbers(HardwareConfig())), ids=lambda given: given if isinstance(given, str) else "")
+def test_every_number_has_an_upper_bound(key, item):
+    if key.endswith(".baud"):
+        return  # one of a list
+    assert bounds_of(item).numeric
+    with pytest.raises(InvalidSetting) as caught:
+        compose(Command, [f"hardware.{key}=100000000000"]).hardware.validate()
+    assert caught.value.name == f"hardware.{key}"
 
 
 @pytest.mark.parametrize("change", ["hardware.first_move=jump", "hardware.on_disconnect=explode"])
@@ -86,6 +120,40 @@ def test_fingers_are_sent_into_the_pin_and_no_further():
     closed = gripper_pulse_us(gripper, 0.0, 2.5)
     assert finger_mm(gripper, closed) == pytest.approx(2.5 / 2 - gripper.preload_mm, abs=0.02)
     assert gripper_pulse_us(GripperConfig(preload_mm=3.0), 0.0, 2.5) == gripper.closed_us
+
+
+@pytest.mark.parametrize(("preload_mm", "pin_mm"), [(1.25, 2.5), (3.0, 2.5), (0.6, 1.2), (0.25, 0.5)])
+def test_fingers_never_close_to_their_end(preload_mm, pin_mm):
+    """They would press on nothing but each other, with all that the servo has: its gears strip."""
+    config = HardwareConfig()
+    config.arms["right"].gripper.preload_mm = preload_mm
+    with pytest.raises(InvalidSetting, match=r"hardware.arms.(left|right).gripper.preload_mm .*pin_diameter_mm"):
+        config.require_grip(pin_mm)
+    HardwareConfig().require_grip(2.5)
+
+
+def test_a_cell_whose_pin_is_too_thin_for_the_preload_is_not_connected(rig, model, one_board):
+    thin = replace(model.cell.config, block=BlockConfig(pin_diameter_mm=1.0))
+    with pytest.raises(InvalidSetting, match="preload_mm"):
+        ArmDriver(one_board, model._replace(cell=replace(model.cell, config=thin)))
+
+
+def test_a_gate_that_is_off_is_said_at_every_start_and_before_the_first_move(rig, one_board, caplog):
+    one_board.gate.enabled = False
+    for _ in range(2):
+        caplog.clear()
+        asked = []
+        made = rig(one_board, confirm=lambda text, asked=asked: asked.append(text) or True)
+        with made.driver as driver:
+            driver.arm()
+        assert [record.levelname for record in caplog.records] == ["WARNING"]
+        assert "THE SAFETY GATE IS OFF (hardware.gate.enabled=false)" in caplog.text
+        assert "THE SAFETY GATE IS OFF" in asked[0]
+
+
+def test_a_gate_that_is_on_is_not_spoken_of(armed, caplog):
+    armed()
+    assert caplog.records == []
 
 
 def test_wiring_translates_there_and_back(model):
