@@ -77,14 +77,14 @@ def work(driver, motion):
     driver.park()
 
 
-def check_stops(armed, config, motion, count, seed):
-    """Stop ``count`` fresh sessions."""
+def check_stops(armed, config, motion, count, seed, deed=work):
+    """Stop ``count`` fresh sessions at their ``deed``."""
     random, moving, latest_s = np.random.default_rng(seed), 0, 0.0
     for after_s in moments(random, config, count, motion.duration_s + 2.5):
         rig = armed(config)
         witness = Witness(rig, rig.clock.now_s() + after_s)
         with pytest.raises(Stopped, match="another process"):
-            work(rig.driver, motion)
+            deed(rig.driver, motion)
         latest_s = max(latest_s, witness.judge())
         assert rig.latch.obeyed_by() is not None
         moving += witness.moving
@@ -143,3 +143,46 @@ def test_nothing_starts_while_a_stop_is_latched(rig):
     with pytest.raises(Stopped, match="yesterday"):
         made.driver.arm()
     assert not any(made.device.outputs_us(made.clock.now_s() + 1.0))
+
+
+def both(driver, _):
+    """Both arms all the time, on one time axis."""
+    swing = driver.parked_rad + np.outer(0.3 * (1 - np.cos(np.linspace(0, 2 * np.pi, 61))) / 2, [1, 0, 0, 0, 0])
+    phase = Phase("transfer", np.linspace(0, 1.2, 61), swing, np.full(61, 12.0))
+    for _ in range(9):
+        stream(driver, {0: [phase], 1: [phase]})
+
+
+def test_a_stop_with_both_arms_moving(armed, wired, motion):
+    check_stops(armed, wired, motion, 12, 3, both)
+
+
+@pytest.mark.slow
+def test_two_hundred_stops_with_both_arms_moving(armed, wired, motion):
+    check_stops(armed, wired, motion, 200, 4, both)
+
+
+def test_real_and_simulated_arms_stop_without_each_other(armed, tmp_path, monkeypatch):
+    """A simulation beside a session of real arms: neither obeys the other's stop."""
+    from marl_handover.hardware import latch as latches
+    from marl_handover.hardware.latch import PrivateStop
+
+    monkeypatch.setattr(latches, "user_path", lambda suffix: tmp_path / f"user{suffix}")
+    real = armed()
+    simulated = armed()  # its boards take the place of the first ones' names; ports that are open stay
+    simulated.driver.latch = PrivateStop()
+    real.clock.at(real.clock.now_s() + 0.3, lambda: StopLatch(real.latch.path).latch("real arms"))
+    with pytest.raises(Stopped, match="real arms"):
+        both(real.driver, None)
+    both(simulated.driver, None)
+    assert simulated.driver.state is State.ARMED
+    real.latch.clear()
+    real.driver.resume()
+    simulated.clock.at(simulated.clock.now_s() + 0.3, lambda: simulated.driver.latch.latch("simulated arms"))
+    with pytest.raises(Stopped, match="simulated arms"):
+        both(simulated.driver, None)
+    assert not real.latch.is_set()
+    real.driver.park()
+    assert real.driver.state is State.ARMED
+    simulated.driver.close()
+    assert [path.name for path in tmp_path.glob("user*.stop")] == []

@@ -12,12 +12,15 @@ import pytest
 
 from marl_handover import policies
 from marl_handover.arrays import wrap
-from marl_handover.config import MotionConfig
+from marl_handover.cell.build import build_cell, cell_config
+from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.envs.backends import make_backend
 from marl_handover.errors import MissingFile
+from marl_handover.hardware import latch, roll, settings
 from marl_handover.hardware.emulator.faults import make_fault
-from marl_handover.hardware.errors import DeviceError, Stopped
+from marl_handover.hardware.errors import DeviceError, PulseMismatch, Stopped
 from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.session import State
 from marl_handover.hardware.settings import ARMS
 from marl_handover.runtime.evaluation import truly_solved
 from marl_handover.runtime.events import FAULTS, Event
@@ -360,3 +363,36 @@ def test_a_dry_run_does_everything_and_moves_nothing(start):
 def test_without_a_calibration_there_is_no_twin(model, tmp_path):
     with pytest.raises(MissingFile, match="calibrate"):
         make_backend("twin", model, policies.adapted("exact").rules.config, MotionConfig(), calibration=str(tmp_path))
+
+
+@pytest.mark.parametrize("kind", ["ignore", "random", "frozen"])
+def test_a_board_that_disobeys_ends_the_session_by_name(start, kind):
+    lab = start()
+    when(lab, lambda: carried_high(lab), lambda: lab.twin.add_faults([make_fault(kind, lab.clock.now_s())]))
+    with pytest.raises(PulseMismatch, match="board main"):
+        lab.session.play(START, lab.goal)
+    assert lab.counts[Event.PULSE_MISMATCH] == 1
+    assert lab.session.backend.lab.driver.state is State.STOPPED
+
+
+def test_evaluations_on_the_twin_obey_no_stop_and_the_interactive_twin_its_own(twin_calibration, tmp_path, monkeypatch):
+    for module in (roll, settings, latch):
+        monkeypatch.setattr(module, "user_path", lambda suffix: tmp_path / f"user{suffix}")
+    real, twins = (StopLatch(settings.HardwareConfig(name=name).stop_path()) for name in ("lynxmotion", "twin"))
+    model, motion = build_cell(cell_config("paper")), MotionConfig()
+    config = lab_config(twin_calibration, "")
+    interactive = make_backend("hardware", model, TaskConfig(), motion, config=config)
+    real.latch("real arms")
+    interactive.reset(START, 0)
+    twins.latch("the twin")
+    with pytest.raises(Stopped, match="the twin"):
+        interactive.reset(START, 0)
+    evaluated = make_backend("twin", model, TaskConfig(), motion, calibration=str(twin_calibration))
+    evaluated.reset(START, 0)
+    twins.clear()
+    real.clear()
+    evaluated.lab.driver.stop("an evaluation's own")
+    assert not (real.is_set() or twins.is_set())
+    evaluated.close()
+    interactive.close()
+    assert not list(tmp_path.glob("user*stop"))
