@@ -392,7 +392,7 @@ def test_evaluations_on_the_twin_obey_no_stop_and_the_interactive_twin_its_own(t
     twins.clear()
     real.clear()
     evaluated.lab.driver.stop("an evaluation's own")
-    assert not (real.is_set() or twins.is_set())
+    assert [it.is_set() for it in (real, twins)] == [False, False]
     evaluated.close()
     interactive.close()
     assert not list(tmp_path.glob("user*stop"))
