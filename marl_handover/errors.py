@@ -11,6 +11,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from marl_handover.requirements import install_line
+
 LONGEST_VALUE, LONGEST_LIST, LONGEST_REASON = 120, 160, 220
 """Characters of a value, of a list of choices and of a reason in a message."""
 
@@ -183,7 +185,7 @@ class MissingExtra(HandoverError):
     """A setting needs a package that is not installed."""
 
     def __init__(self, setting: str, package: str, extra: str) -> None:
-        super().__init__(f"{setting} needs the package {package}; run: pip install 'marl_handover[{extra}]'")
+        super().__init__(f"{setting} needs the package {package}; run: {install_line(extra)}")
         self.setting, self.package, self.extra = setting, package, extra
 
 

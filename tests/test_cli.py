@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import types
@@ -11,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from marl_handover import cli
-from marl_handover.errors import InvalidSetting, WorkFailed
+from marl_handover.errors import InvalidSetting, MissingExtra, WorkFailed
+from marl_handover.requirements import by_extra, install_line, name_of, requirements
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -125,9 +127,32 @@ def test_doctor(capsys, monkeypatch):
     assert cli.main(["doctor"]) == 0
     out = capsys.readouterr().out
     assert all(word in out for word in ("python", "torch", "compiler", "cameras", "serial ports", "[dev]"))
-    monkeypatch.setattr(doctor, "CORE", ("numpy", "no-such-package"))
+    assert "pip install marl_handover" not in out
+    assert "pip install 'marl_handover" not in out
+    monkeypatch.setattr(doctor, "requirements", lambda: {"": ("numpy>=2", "no-such-package>=1; python_version > '3'")})
     assert cli.main(["doctor"]) == 1
     assert "missing: no-such-package" in capsys.readouterr().out
+
+
+def test_no_message_tells_to_install_this_package_from_an_index_that_has_it_not():
+    """What is missing is named with the versions that are needed."""
+    for path in (ROOT / "marl_handover").rglob("*.py"):
+        assert not re.search(r"pip install ['\"\\]*marl[_-]handover", path.read_text(encoding="utf-8")), path
+    assert install_line("view") == "pip install 'viser>=1.1'"
+    assert str(MissingExtra("view", "viser", "view")).endswith("run: pip install 'viser>=1.1'")
+    assert "'pandas>=2.2,<3'" in install_line("compare")
+    assert install_line("no-such-extra", ["something"]) == "pip install something"
+
+
+def test_metadata_and_pyproject_tell_the_same_requirements():
+    lines = ["numpy>=2", "viser>=1.1; extra == 'view'", 'pandas<3,>=2.2; extra == "compare"']
+    assert by_extra(lines) == {"": ("numpy>=2",), "view": ("viser>=1.1",), "compare": ("pandas<3,>=2.2",)}
+    assert {name_of(line) for line in requirements()["compare"]} == {"rliable", "pandas"}
+
+
+def test_python_m_runs_the_command_line():
+    done = subprocess.run([sys.executable, "-m", "marl_handover", "--version"], capture_output=True, text=True, env=_with_root())
+    assert (done.returncode, done.stdout.split()[0]) == (0, "marl-handover")
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))

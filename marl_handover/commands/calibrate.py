@@ -104,7 +104,7 @@ def _camera(config: CalibrateCommand, plugs: Plugs, assistant: Assistant) -> Non
     x, y, z = found.eye_mm()
     print(
         f"camera: {found.intrinsics.views} views, lens {found.intrinsics.error_px:.2f} px off, place {found.pose_error_px:.2f} px off, "
-        f"eye at ({x:.1f}, {y:.1f}, {z:.1f}) mm -> {path}"
+        f"eye at ({x:z.1f}, {y:z.1f}, {z:z.1f}) mm -> {path}"
     )
 
 

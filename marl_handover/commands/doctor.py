@@ -6,50 +6,16 @@ import importlib
 import importlib.util
 import os
 import platform
-import re
 import shutil
 import sys
-import tomllib
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-PACKAGE = "marl_handover"
-
-
-def _wanted() -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
-    """Packages that the core needs and those of each extra, as the checkout's pyproject.toml or the installed package's metadata has them.
-
-    An editable install's metadata is as old as the install, so the checkout goes first.
-    """
-    file = Path(__file__).resolve().parents[2] / "pyproject.toml"
-    if file.is_file():
-        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
-        extras = project.get("optional-dependencies", {})
-        return _names(project["dependencies"]), {extra: _names(lines) for extra, lines in extras.items()}
-    with suppress(PackageNotFoundError):
-        return _sorted_out(requires(PACKAGE) or [])
-    return (), {}
-
-
-def _sorted_out(requirements: Iterable[str]) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
-    """Packages of the core and of each extra, from the lines of a package's metadata."""
-    by_extra: dict[str, list[str]] = {}
-    for line in requirements:
-        found = re.search(r"extra\s*==\s*['\"]([^'\"]+)", line)
-        by_extra.setdefault(found[1] if found else "", []).append(line)
-    return _names(by_extra.pop("", [])), {extra: _names(lines) for extra, lines in by_extra.items()}
-
-
-def _names(requirements: Iterable[str]) -> tuple[str, ...]:
-    """Their packages, without versions and conditions."""
-    return tuple(re.split(r"[^\w.-]", line.strip(), maxsplit=1)[0] for line in requirements)
-
-
-CORE, EXTRAS = _wanted()
+from marl_handover.requirements import CORE, PACKAGE, install_line, name_of, requirements
+from marl_handover.wording import counted
 
 
 @dataclass
@@ -67,10 +33,11 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: DoctorConfig) -> int:
     """Print the report. Returns 1 if a package is missing without which nothing works, else 0."""
-    missing = [package for package in CORE if _installed(package) is None]
+    core = tuple(map(name_of, requirements().get(CORE, ())))
+    missing = [package for package in core if _installed(package) is None]
     sections = {
         "system": _system(),
-        "packages": _packages(CORE),
+        "packages": _packages(core),
         "devices": _devices(),
         "compiler": _compiler(),
         "cameras": _listed("/dev", "video*", "none found"),
@@ -83,7 +50,7 @@ def run(config: DoctorConfig) -> int:
         for line in lines:
             print(f"  {line}")
     if missing:
-        print(f"missing: {', '.join(missing)}; run: pip install marl_handover")
+        print(f"missing: {', '.join(missing)}; run: {install_line(CORE, missing)}")
         return 1
     return 0
 
@@ -114,7 +81,7 @@ def _devices() -> Iterator[str]:
     except (ImportError, OSError) as error:  # OSError: a shared library that torch needs is not there
         yield f"torch cannot be imported: {' '.join(str(error).split())}"
         return
-    yield f"cpu            {torch.get_num_threads()} threads"
+    yield f"cpu            {counted(torch.get_num_threads(), 'thread')}"
     if not torch.cuda.is_available():
         yield "cuda           not available; device=cpu is used"
     for index in range(torch.cuda.device_count()):
@@ -224,7 +191,8 @@ def _group(path: Path) -> str:
 
 
 def _extras() -> Iterator[str]:
-    for extra, packages in EXTRAS.items():
-        missing = [package for package in packages if _installed(package) is None]
-        state = f"missing {', '.join(missing)}; run: pip install 'marl_handover[{extra}]'" if missing else "complete"
-        yield f"[{extra}]".ljust(15) + state
+    for extra, needed in requirements().items():
+        if extra == CORE:
+            continue
+        missing = [package for package in map(name_of, needed) if _installed(package) is None]
+        yield f"[{extra}]".ljust(15) + (f"missing {', '.join(missing)}; run: {install_line(extra)}" if missing else "complete")

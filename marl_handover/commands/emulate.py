@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from marl_handover.config import path_field, require_choice, require_seed
-from marl_handover.errors import InvalidSetting
+from marl_handover.errors import InvalidSetting, WorkFailed
 from marl_handover.hardware.settings import HardwareConfig
 
 if TYPE_CHECKING:
@@ -34,7 +34,10 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: EmulateConfig) -> int:
     """Serve until Ctrl-C or SIGTERM, which is how it is meant to end: 0 then."""
-    from marl_handover.hardware.emulator.pty import PtyEmulator
+    try:
+        from marl_handover.hardware.emulator.pty import PtyEmulator
+    except ImportError as error:
+        raise WorkFailed(f"emulate needs pseudo-terminals, which this system does not have ({error})") from error
 
     emulator = PtyEmulator(_device(config), config.link)
     stopped: list[int] = []

@@ -15,6 +15,7 @@ from marl_handover.files import write_whole
 from marl_handover.learning.evaluation import Evaluation
 from marl_handover.runtime.assessment import AssessmentConfig, assess
 from marl_handover.task.rules import Outcome
+from marl_handover.wording import counted
 
 
 @dataclass
@@ -53,7 +54,7 @@ def table(report: dict[str, Any], result: Evaluation) -> str:
     outcomes = "  ".join(f"{name} {count}" for name, count in report["outcomes"].items())
     lines = [
         f"{report['policy']}: architecture {report['architecture']}, backend {report['backend']}, "
-        f"epsilon {report['epsilon_deg']:g} deg, {report['episodes']} episodes, seed {report['seed']}",
+        f"epsilon {report['epsilon_deg']:g} deg, {counted(report['episodes'], 'episode')}, seed {report['seed']}",
         "",
         f"{'':22}{'policy':>12}{'optimum':>12}",
         f"{'success':22}{100 * report['success_rate']:>11.2f}%{100 * (result.optimal > 0).mean():>11.2f}%",
@@ -82,7 +83,7 @@ def _loop_lines(report: dict[str, Any]) -> list[str]:
     refused = "  ".join(f"{name} {count}" for name, count in report["refusals"].items()) or "none"
     return [
         "",
-        f"success in the end: {100 * report['success_in_the_end']:.2f} %, after {report['transfers']} transfers in all",
+        f"success in the end: {100 * report['success_in_the_end']:.2f} %, after {counted(report['transfers'], 'transfer')} in all",
         f"at the goal:  {pair('position_error_mm', 'mm')}; {pair('orientation_error_deg', 'deg')}",
         f"one transfer: {pair('transfer_error_mm', 'mm')}; {pair('transfer_error_deg', 'deg')}",
         f"refused or failed: {refused}",

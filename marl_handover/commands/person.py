@@ -46,7 +46,7 @@ class Person:
     def lay_board(self, sheet: Sheet, place: Sequence[float]) -> None:
         """See the protocol."""
         _wait(
-            f"lay the board flat, its middle at x = {place[0]:g} mm, y = {place[1]:g} mm, its rows turned by {math.degrees(place[2]):.0f} "
+            f"lay the board flat, its middle at x = {place[0]:g} mm, y = {place[1]:g} mm, its rows turned by {math.degrees(place[2]):z.0f} "
             "degrees from +x"
         )
 

@@ -33,6 +33,7 @@ from marl_handover.learning.rollout import nobody_moves
 from marl_handover.policies import SupervisorPolicy, adapted
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Outcome, Rules, Transition
+from marl_handover.wording import counted
 
 if TYPE_CHECKING:
     from marl_handover.motion.planner import MotionPlanner
@@ -100,7 +101,7 @@ def run(config: PlanConfig) -> int:
         save_figure(plan_figure(plan, rules.cell), Path(config.picture), "picture")
     if plan["outcome"] != Outcome.SUCCESS.name.lower():
         waiting = "; no arm moves any more" if plan["waiting"] else ""
-        made = counted(len(plan["transfers"]))
+        made = counted(len(plan["transfers"]), "transfer")
         raise WorkFailed(f"policy {policy.name!r} did not reach the goal: {plan['outcome']} after {made}{waiting}")
     return 0
 
@@ -257,11 +258,6 @@ def _policy(config: PlanConfig) -> SupervisorPolicy:
     return adapted(config.policy, config.cell, seed=config.seed, **named, noise=NoiseConfig())
 
 
-def counted(count: int) -> str:
-    """``1 transfer``, ``2 transfers``."""
-    return f"{count} transfer{'' if count == 1 else 's'}"
-
-
 def _text(plan: dict[str, Any], rules: Rules) -> str:
     """The sequence as a table, in mm and deg."""
     goal_theta = plan["goal"][2]
@@ -272,19 +268,19 @@ def _text(plan: dict[str, Any], rules: Rules) -> str:
 
     def row(step: str, arm: str, final: str, pose: list[float], path: str = "", note: str = "") -> str:
         left = math.degrees(rules.orientation_error(pose[2], goal_theta))
-        x, y, theta, left = (round(value, 2) + 0.0 for value in (pose[0], pose[1], math.degrees(pose[2]), left))  # + 0.0: no -0.0
-        return f"{step:>4}  {arm:<3}  {final:<5}  {x:8.1f} {y:8.1f} {theta:12.2f} {left:14.2f} {path:>10}  {note}".rstrip()
+        x, y, theta = pose[0], pose[1], math.degrees(pose[2])
+        return f"{step:>4}  {arm:<3}  {final:<5}  {x:z8.1f} {y:z8.1f} {theta:z12.2f} {left:z14.2f} {path:>10}  {note}".rstrip()
 
     lines.append(row("0", "", "", plan["start"], note="start"))
     for number, transfer in enumerate(plan["transfers"], start=1):
-        place = "" if transfer["alpha"] is None else f"{transfer['alpha']:+.3f}, {round(transfer['beta'], 3) + 0.0:+.3f}"
+        place = "" if transfer["alpha"] is None else f"{transfer['alpha']:+z.3f}, {transfer['beta']:+z.3f}"
         note = f"refused: {REASONS[transfer['refusal']]}" if transfer["refused"] else place
         path = f"{transfer['path_mm']:.1f}"
         lines.append(row(str(number), transfer["arm"], "yes" if transfer["final"] else "no", transfer["to"], path, note))
     lines.append(row("goal", "", "", plan["goal"]))
     optimum = "none within the limit" if plan["optimal_transfers"] is None else plan["optimal_transfers"]
     lines.append(
-        f"{plan['outcome']}: {counted(len(plan['transfers']))} (optimum {optimum}), path {plan['total_path_mm']:.1f} mm, "
+        f"{plan['outcome']}: {counted(len(plan['transfers']), 'transfer')} (optimum {optimum}), path {plan['total_path_mm']:.1f} mm, "
         f"orientation error {abs(plan['orientation_error_deg']):.2f} deg"
     )
     return "\n".join(lines)

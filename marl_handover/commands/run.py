@@ -16,6 +16,7 @@ from marl_handover.commands.person import confirmed, laid_anew
 from marl_handover.config import POSE, CellConfig, LoopConfig, MotionConfig, TaskChanges, bounded, check_bounds, path_field, seed_field
 from marl_handover.errors import InvalidSetting, MissingFile, OutOfReach
 from marl_handover.runtime.settings import LabConfig
+from marl_handover.wording import counted
 
 if TYPE_CHECKING:
     from marl_handover.runtime.episode import Episode
@@ -133,7 +134,7 @@ def _play(config: RunCommand, session: Session, loop: ClosedLoop, start: Floats,
 def _tell(number: int, episode: Episode, wall_s: float) -> None:
     from marl_handover.runtime.session import transfer_line
 
-    print(f"episode {number}: {episode.ended} after {len(episode.transfers)} transfers, {wall_s:.1f} s", flush=True)
+    print(f"episode {number}: {episode.ended} after {counted(len(episode.transfers), 'transfer')}, {wall_s:.1f} s", flush=True)
     for transfer in episode.transfers:
         print(transfer_line(transfer))
 

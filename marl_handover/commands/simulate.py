@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from marl_handover import policies
 from marl_handover.arrays import wrap
@@ -20,7 +19,9 @@ from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import POSE, CellConfig, MotionConfig, TaskChanges, bounded, check_bounds, chosen, path_field, seed_field
 from marl_handover.errors import InvalidSetting, OutOfReach, WorkFailed
 from marl_handover.policies.policy import NobodyMoves
+from marl_handover.progress import Bar
 from marl_handover.task.rules import Outcome
+from marl_handover.wording import counted
 
 if TYPE_CHECKING:
     from marl_handover.envs.handover_aec import HandoverEnv
@@ -90,7 +91,7 @@ def run(config: SimulateCommand) -> int:
         backend.close()
     failed = [episode.outcome for episode in played if episode.outcome != "success"]
     simulated, wall = sum(p.simulated_s for p in played), sum(p.wall_s for p in played)
-    print(f"{len(played) - len(failed)} of {len(played)} episodes reached the goal; {simulated:.1f} s simulated in {wall:.1f} s")
+    print(f"{len(played) - len(failed)} of {counted(len(played), 'episode')} reached the goal; {simulated:.1f} s simulated in {wall:.1f} s")
     if failed:
         raise WorkFailed(f"policy {config.policy!r} did not reach the goal: {', '.join(sorted(set(failed)))}")
     return 0
@@ -129,7 +130,7 @@ def _recording(config: SimulateCommand, backend: BulletBackend, rules: Rules) ->
     size = (config.size[0], config.size[1])
     with filming(config.video, config.fps, backend, size, config.captions, rules.orientation_error) as film:
         yield film
-    print(f"wrote {config.video}")
+    print(f"written: {config.video}")
 
 
 def _episodes(
@@ -145,8 +146,7 @@ def _episodes(
     for key, given in (("state", config.start), ("goal", config.goal)):
         if given is not None:
             problem[key] = [given[0], given[1], float(wrap(math.radians(given[2])))]
-    hidden = None if config.progress else True  # None: shown on a terminal only; a file would keep what the bar wipes out
-    with tqdm(total=config.episodes, unit="episode", disable=hidden, leave=False) as bar:
+    with Bar(total=config.episodes, unit="episode", shown=config.progress, leave=False) as bar:
         for episode in range(config.episodes):
             env.reset(seed=config.seed if episode == 0 else None, options=problem or None)
             goal = env.observe("supervisor")["goal"]
@@ -195,13 +195,13 @@ def play(
         came = "done" if refusal is None else f"{refusal}{_reason(arms[agent])}"
         rate = seconds / (time.perf_counter() - started)
         say(
-            f"  {ARM_LETTERS[arms[agent].arm]} to ({observation['target'][0]:.1f} mm, {observation['target'][1]:.1f} mm): {came}; "
+            f"  {ARM_LETTERS[arms[agent].arm]} to ({observation['target'][0]:z.1f} mm, {observation['target'][1]:z.1f} mm): {came}; "
             f"object {_pose(backend.cell.object_pose())}; {seconds:.1f} s, {rate:.1f} x real time"
         )
     infos = env.infos["supervisor"]  # empty at the reset
     outcome = Outcome.TIMEOUT.name.lower() if stopped else str(infos["outcome"])
     played = Played(outcome, int(infos.get("transfers", 0)), simulated, time.perf_counter() - began)
-    say(f"{outcome} after {played.transfers} transfers")
+    say(f"{outcome} after {counted(played.transfers, 'transfer')}")
     return played
 
 
@@ -210,4 +210,4 @@ def _reason(arm: ExecutorAgent) -> str:
 
 
 def _pose(pose: Floats) -> str:
-    return f"({pose[0]:.1f} mm, {pose[1]:.1f} mm, {math.degrees(pose[2]):.1f} deg)"
+    return f"({pose[0]:z.1f} mm, {pose[1]:z.1f} mm, {math.degrees(pose[2]):z.1f} deg)"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 from dataclasses import asdict
 from datetime import datetime
@@ -29,9 +28,6 @@ def run(config: TrainConfig) -> int:
     Raises:
         FolderBusy: another process trains in that folder.
     """
-    import torchrl  # noqa: F401 - sets its own level
-
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
     if config.resume:
         folder = Path(config.resume)
         if not folder.is_dir():

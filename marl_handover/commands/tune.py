@@ -8,14 +8,14 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tqdm import tqdm
-
 from marl_handover.commands import train
 from marl_handover.config import bounded, check_bounds, chosen, name_field, path_field
 from marl_handover.errors import InvalidSetting
 from marl_handover.files import write_whole
 from marl_handover.learning.settings import TrainConfig
+from marl_handover.progress import say
 from marl_handover.resources import resource_path
+from marl_handover.wording import counted
 
 if TYPE_CHECKING:
     from optuna.study import Study
@@ -66,7 +66,7 @@ def run(config: TuneConfig) -> int:
     for note in run_trials(search, study, left, **options):
         notes.append(note)
         if config.progress or note.error:
-            tqdm.write(_line(note), file=sys.stderr)
+            say(_line(note))
     _report(search, study, out, notes)
     return 0
 
@@ -113,7 +113,7 @@ def _report(search: Search, study: Study, out: Path, notes: list[Note]) -> None:
     settings = best_settings(study, search)
     write_preset(settings, study, out / "best.yaml")
     best = study.best_trial
-    print(f"best of {len(study.trials)} trials: {best.number}, score {best.value:.4f}, {_measured(best.user_attrs)}")
+    print(f"best of {counted(len(study.trials), 'trial')}: {best.number}, score {best.value:.4f}, {_measured(best.user_attrs)}")
     print(f"marl-handover train {' '.join(arguments(settings))}")
     print(f"the same: marl-handover train preset={out / 'best.yaml'}; all trials: {out / 'trials.csv'}")
 

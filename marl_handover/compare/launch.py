@@ -17,10 +17,10 @@ from typing import Any, TypeVar
 
 import cloudpickle
 from joblib import cpu_count
-from tqdm import tqdm
 
 from marl_handover.compare.workers import LokyWorkers, Outcome, died, run_parallel
 from marl_handover.config import require_at_least, require_choice
+from marl_handover.progress import Bar
 
 LAUNCHERS = ("loky", "ray")
 LOG = logging.getLogger(__name__)
@@ -100,7 +100,7 @@ def _delivered(
     items: list[Item], names: list[str], outcomes: Generator[Outcome, None, None], progress: bool
 ) -> Generator[tuple[Item, Any], None, None]:
     """Each outcome unpacked, with a bar."""
-    bar = tqdm(total=len(items), unit="item", disable=not progress, dynamic_ncols=True)
+    bar = Bar(total=len(items), unit="item", shown=progress)
     with bar, closing(outcomes):
         for outcome in outcomes:
             item = items[outcome.index]

@@ -8,7 +8,6 @@ name. Only one call at a time works at a task: ``seed<k>.lock`` beside its folde
 
 from __future__ import annotations
 
-import logging
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -208,7 +207,6 @@ def _train(task: Task, config: TrainConfig, here: Mapping[str, Any]) -> None:
     from marl_handover.learning.checkpoint import FILE
     from marl_handover.learning.trainer import Trainer
 
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
     settings = settings_of(config)
     folder = task.folder / RUN_FOLDER
     before = read_record(task.folder / ASKED, records.ASKED_KEYS)

@@ -6,7 +6,6 @@ the trials that are left, and those whose process was killed are started again f
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
@@ -147,7 +146,6 @@ def run_trial(search: Search, slot: str) -> Note | None:
         search: what to do.
         slot: a name that no other item of any call has. One that is run again takes over what a dead worker left.
     """
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
     study = open_study(search.storage, search.study, pruner=_pruner(search))
     _take_back(study, slot)
     if counted(study) >= search.trials:

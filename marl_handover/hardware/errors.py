@@ -7,6 +7,13 @@ from typing import Any
 
 from marl_handover.errors import HandoverError, WorkFailed
 
+try:
+    from termios import error as FlushFailed
+except ImportError:  # a system without terminals of that kind; its ports raise OSError
+
+    class FlushFailed(Exception):  # type: ignore[no-redef]
+        """Never raised there."""
+
 
 class BadCommand(HandoverError):
     """A command that the board's language cannot carry, or that must not be sent."""

@@ -139,11 +139,11 @@ class Roll:
 
 def user_name(uid: int) -> str:
     """A user by name, or by number if there is no name."""
-    import pwd
-
     try:
+        import pwd
+
         return pwd.getpwuid(uid).pw_name
-    except KeyError:
+    except (ImportError, KeyError):  # a system without such a list
         return f"user {uid}"
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import termios
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple
 import serial
 
 from marl_handover.hardware.clock import Clock
-from marl_handover.hardware.errors import PortLost, PortNotFound
+from marl_handover.hardware.errors import FlushFailed, PortLost, PortNotFound
 from marl_handover.hardware.ports import list_serial_ports
 from marl_handover.hardware.protocol import CANCEL
 from marl_handover.hardware.settings import TimeoutConfig
@@ -22,7 +21,7 @@ ATTEND_S = 0.004
 """Nobody who waits for an answer is out of reach for longer."""
 
 _SCHEMES = "marl_handover.hardware.emulator"
-_FAILURES = (serial.SerialException, OSError, termios.error)
+_FAILURES = (serial.SerialException, OSError, FlushFailed)
 """Of a port that was pulled out: pyserial lets ``in_waiting`` raise a bare OSError, and flushing termios's own error, which is none."""
 
 if _SCHEMES not in serial.protocol_handler_packages:

@@ -20,6 +20,7 @@ from marl_handover.errors import InvalidSetting
 from marl_handover.learning.algorithm_settings import AlgorithmConfig
 from marl_handover.learning.exploration import UniformActions
 from marl_handover.learning.settings import TrainConfig
+from marl_handover.progress import working
 from marl_handover.task.rules import Rules
 
 logger = logging.getLogger(__name__)
@@ -112,22 +113,24 @@ def compiled(function: Callable[..., Any], mode: str) -> Callable[..., Any]:
     if mode == "off" or not can_compile():
         return function
     torch.compiler.reset()
-    fast = torch.compile(function, dynamic=False)
-    return fast if mode == "on" else _Fallback(function, fast)
+    return _Compiled(function, torch.compile(function, dynamic=False), falls_back=mode == "auto")
 
 
-class _Fallback:
-    """Calls the compiled function; if compiling fails, the plain one, from then on."""
+class _Compiled:
+    """Calls the compiled function, which compiles it at the first call; if that fails and it may, the plain one from then on."""
 
-    def __init__(self, plain: Callable[..., Any], fast: Callable[..., Any]) -> None:
-        self.plain, self.chosen, self.proven = plain, fast, False
+    def __init__(self, plain: Callable[..., Any], fast: Callable[..., Any], falls_back: bool) -> None:
+        self.plain, self.chosen, self.falls_back, self.proven = plain, fast, falls_back, False
 
     def __call__(self, *arguments: Any) -> Any:
         if self.proven:
             return self.chosen(*arguments)
         try:
-            result = self.chosen(*arguments)
+            with working("compiling the losses; once in a run"):
+                result = self.chosen(*arguments)
         except Exception as error:  # the compiler's failures have many types
+            if not self.falls_back:
+                raise
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             logger.warning("torch.compile failed (%s); training goes on uncompiled, which is slower", reason)
             self.chosen = self.plain

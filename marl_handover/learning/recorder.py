@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from torch import Tensor
-from tqdm import tqdm
 
 from marl_handover.errors import Diverged
 from marl_handover.files import GrowingFile, write_whole
+from marl_handover.progress import Bar
 
 COLUMNS = (
     "step",
@@ -54,7 +54,7 @@ class Recorder:
         self._keep_until(start_step)
         self.table = GrowingFile(self.path)
         self.board = Board(folder, start_step)
-        self.bar = tqdm(total=total_steps, initial=start_step, unit="step", disable=not progress, dynamic_ncols=True)
+        self.bar = Bar(total=total_steps, initial=start_step, unit="step", shown=progress)
 
     def _keep_until(self, step: int) -> None:
         """Rewrite the table with its header and the rows up to ``step``."""
@@ -67,9 +67,9 @@ class Recorder:
 
     def progress(self, step: int, **shown: Any) -> None:
         """Move the bar."""
-        self.bar.update(step - self.bar.n)
         if shown:
-            self.bar.set_postfix(shown)
+            self.bar.set_postfix(shown, refresh=False)
+        self.bar.update(step - self.bar.n)
 
     def record(self, row: dict[str, float]) -> None:
         """Append one row; values that a run does not have stay empty."""

@@ -11,6 +11,7 @@ action aimed at s' and missed it by the noise, or by a missed grasp, and the rel
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import torch
@@ -23,6 +24,8 @@ from marl_handover.cell.symmetry import GROUP
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.settings import ReplayConfig
 from marl_handover.task.rules import Command, Rules, carried
+
+logging.getLogger("torchrl").setLevel(logging.WARNING)  # which its import sets to tell of every memory that is made
 
 STORED = ("achieved_goal", "desired_goal", "previous_arm", "action", "placed", "feasible", "epsilon", "terminated")
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.config import require_positive, require_seed
 from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed
+from marl_handover.requirements import install_line
 
 Floats = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ class OmplMissing(WorkFailed):
     """OMPL is not installed."""
 
     def __init__(self) -> None:
-        super().__init__('the sampling planner needs OMPL; run: pip install "marl_handover[ompl]"')
+        super().__init__(f"the sampling planner needs OMPL; run: {install_line('ompl')}")
 
 
 def rrt_connect(

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from marl_handover.arrays import Array, namespace, select, wrap
 from marl_handover.cell import Cell, build_cell
@@ -32,6 +31,7 @@ from marl_handover.compose import to_yaml
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.errors import CannotWrite, CorruptFile, HandoverError, MissingFile
 from marl_handover.files import cache_folder, writing
+from marl_handover.progress import Bar
 from marl_handover.resources import package_path
 from marl_handover.task.rules import MotionCost, straight_line_mm
 
@@ -206,7 +206,7 @@ def build_table(cell: Cell, motion: MotionConfig, *, progress: bool = True) -> P
     radii, yaws = np.linspace(cell.r_min_mm, cell.r_max_mm, RADII), np.linspace(0.0, span, YAWS)
     excess = np.zeros((RADII, RADII, YAWS))
     nodes: Iterable[tuple[int, int]] = [(i, j) for i in range(RADII) for j in range(i, RADII)]
-    for i, j in tqdm(nodes, desc="path costs", unit=f"x{YAWS} paths", disable=not progress):
+    for i, j in Bar(nodes, desc="path costs", unit=f"x{YAWS} paths", shown=progress):
         for k in range(1 if i == j else 0, YAWS):  # no way at all: what is near it adds nothing to the string either
             ends = _places(cell, middle, radii[i], radii[j], yaws[k])
             excess[i, j, k] = excess[j, i, k] = _excess_mm(planner, *ends)

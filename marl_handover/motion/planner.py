@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -22,13 +20,13 @@ from marl_handover.motion.grasp_ik import grasp_joints
 from marl_handover.motion.initial_guesses import GRIP_LEAST_MM, SAMPLES, carrying_guesses, reaching_guesses
 from marl_handover.motion.path_optimizer import FoundPath, Segment, find_path
 from marl_handover.motion.trajectory import PickPlacePaths, TransferMotion
+from marl_handover.progress import working
 
 Floats = NDArray[np.float64]
 
 PAPER_TOLERANCE_MM = 1.0
 """The paper's formulation holds its demands at its samples; in between it may fall short by this much."""
 
-NOTICE_S = 1.5
 STILL_MM = 1e-3
 """A transfer shorter than this is none."""
 
@@ -100,16 +98,11 @@ class MotionPlanner:
 
     def warm_up(self) -> None:
         """Plan and time one cycle, so that what is compiled on first use is; where that takes long, say so on stderr."""
-        notice = threading.Timer(NOTICE_S, print, ["compiling the motion kernels; once, they are cached ..."], {"file": sys.stderr})
-        notice.daemon = True
-        notice.start()
-        try:
+        with working("compiling the motion kernels; once, they are cached"):
             cell = self.model.cell
             pick, place = cell.bases[0].around((cell.r_min_mm + cell.r_max_mm) / 2, (-0.3, 0.3))
             with suppress(WorkFailed):  # settings under which nothing can move are for the first real command to name
                 self.pick_place(0, pick, place, self.home_rad, self.home_rad)
-        finally:
-            notice.cancel()
 
     def transfer(self, arm: int, pick_mm: Floats, place_mm: Floats, other_joints_rad: Floats) -> FoundPath:
         """The path of the loaded hand from pick to place (world, mm). Raises as :meth:`plan_paths`."""

@@ -40,7 +40,7 @@ class OutOfArmsReach(WorkFailed):
 
     def __init__(self, arm: int, what: str, position_mm: Floats) -> None:
         self.arm, self.what, self.position_mm = arm, what, position_mm
-        super().__init__(f"arm {arm} cannot {what} at ({position_mm[0]:.1f}, {position_mm[1]:.1f}) mm: outside its manipulation space")
+        super().__init__(f"arm {arm} cannot {what} at ({position_mm[0]:z.1f}, {position_mm[1]:z.1f}) mm: outside its manipulation space")
 
 
 class PickPlacePaths(NamedTuple):

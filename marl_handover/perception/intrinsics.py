@@ -11,6 +11,7 @@ import numpy as np
 from marl_handover.perception.boards import board_corners_mm, charuco_board
 from marl_handover.perception.calibration import CalibrationFailed, Floats, Intrinsics, Pixels
 from marl_handover.perception.settings import BoardConfig
+from marl_handover.wording import counted
 
 LEAST_VIEWS, LEAST_CORNERS = 8, 8
 LARGEST_ERROR_PX = 1.0
@@ -61,7 +62,7 @@ def calibrate_lens(images: Iterable[Pixels], config: BoardConfig) -> Intrinsics:
             views.append(found)
     if size is None or len(views) < LEAST_VIEWS:
         raise CalibrationFailed(
-            f"the board is found in {len(views)} pictures, {LEAST_VIEWS} are needed; "
+            f"the board is found in {counted(len(views), 'picture')}, {LEAST_VIEWS} are needed; "
             f"is it the board of {config.columns} x {config.rows} squares with {config.dictionary} markers, in focus and evenly lit?"
         )
     lens, errors, slants = _fit(views, (size[1], size[0]))

@@ -21,10 +21,12 @@ from marl_handover.perception.calibration import Pixels
 from marl_handover.perception.camera import Camera, Clock, EndOfFrames, Frame, LiveCamera, NoCamera, RenderedCamera, Reopening
 from marl_handover.perception.overlay import decoded
 from marl_handover.perception.settings import CameraConfig
+from marl_handover.requirements import install_line
+from marl_handover.wording import counted
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 BY_ID = "/dev/v4l/by-id/*"
-INSTALL_REALSENSE = 'pip install "marl_handover[realsense]" (and, on Debian or Ubuntu, apt install libusb-1.0-0)'
+INSTALL_REALSENSE = f"{install_line('realsense')} (and, on Debian or Ubuntu, apt install libusb-1.0-0)"
 
 _MS = 1000
 _PICTURE_BYTES = 100_000_000
@@ -73,7 +75,7 @@ class Recording(Camera):
         """The next picture; it is never too old."""
         following = next(self._pictures, None)
         if following is None:
-            raise EndOfFrames(f"the recording ends after {self._number} pictures")
+            raise EndOfFrames(f"the recording ends after {counted(self._number, 'picture')}")
         self._number += 1
         return Frame(following[1], self._opened_s + following[0], self._number)
 

@@ -16,6 +16,7 @@ from marl_handover.report.compare_bars import bars_figure, endings_figure, legen
 from marl_handover.report.palette import FAINT, GREY, INK, PAPER, series_marker, series_style
 from marl_handover.report.table import Axes
 from marl_handover.report.workspace import workspace_figure
+from marl_handover.wording import counted
 
 Tree = Mapping[str, Any]
 
@@ -77,7 +78,7 @@ def _curve(axes: Axes, row: Tree, spec: Tree, style: Mapping[str, Any]) -> None:
     curve = row["curves"][spec["measure"]]
     scale = 1.0 / row["settings"]["steps"] if spec["x"] == "share" else 1.0
     steps = scale * np.array(curve["step"])
-    label = f"{row['label']} ({curve['runs']} seed{'s' if curve['runs'] > 1 else ''})"
+    label = f"{row['label']} ({counted(curve['runs'], 'seed')})"
     every = math.ceil(len(steps) / MARKERS)
     axes.plot(
         steps,

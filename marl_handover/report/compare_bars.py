@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 
 from marl_handover.report.palette import BLUE, FAINT, GREY, HATCHES, INK, OUTCOMES, PAPER, RED
 from marl_handover.report.table import Axes
+from marl_handover.wording import counted
 
 Tree = Mapping[str, Any]
 
@@ -92,7 +93,7 @@ def endings_figure(results: Tree, spec: Tree) -> Figure | None:
                 box = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "edgecolor": "none", "alpha": 0.85}
                 axes.text(left + share / 2, line, f"{share:.1f}", ha="center", va="center", fontsize=7, color=INK, bbox=box)
             left += share
-        axes.text(1.02, line, f"{found['episodes']:,} episodes", transform=axes.get_yaxis_transform(), va="center", fontsize=7)
+        axes.text(1.02, line, counted(found["episodes"], "episode"), transform=axes.get_yaxis_transform(), va="center", fontsize=7)
     axes.set_xlim(0, 100)
     axes.set_xlabel("episodes [%]", fontsize=9)
     _ruled(axes)

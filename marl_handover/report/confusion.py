@@ -19,6 +19,7 @@ from marl_handover.errors import InvalidSetting
 from marl_handover.report.palette import BLUE, GREY, INK, PAPER
 from marl_handover.report.traces import Trace, foreseen, symmetry_of
 from marl_handover.task.rules import Outcome, Rules
+from marl_handover.wording import counted
 
 Integers = NDArray[np.int64]
 
@@ -36,7 +37,7 @@ def meant_figure(trace: Trace, rules: Rules, title: str = "") -> Figure:
     counts = _table(foreseen(trace, rules), trace.outcome, MEANT, ENDINGS)
     # Exact arms miss a place only by not going there.
     rows = [*(f"final:\n{_name(outcome)}" for outcome in MEANT[:2]), "refused:\nwrong position", "a hand-over"]
-    heading = f"{title}{': ' if title else ''}last transfers of {len(trace.episode):,} episodes"
+    heading = f"{title}{': ' if title else ''}last transfers of {counted(len(trace.episode), 'episode')}"
     return _figure(counts, rows, "expected of the last transfer", "how the episode ended", heading)
 
 
@@ -52,7 +53,7 @@ def endings_against(first: Trace, second: Trace, names: tuple[str, str]) -> Figu
         raise InvalidSetting("trace", f"[{', '.join(names)}]", "two traces of the same problems, evaluated with one seed and count")
     counts = _table(one.outcome, other.outcome, ENDINGS, ENDINGS)
     kept, lost, gained = counts[0, 0], counts[0, 1:].sum(), counts[1:, 0].sum()
-    heading = f"{len(both):,} problems: both solve {kept:,}, only the first {lost:,}, only the second {gained:,}"
+    heading = f"{counted(len(both), 'problem')}: both solve {kept:,}, only the first {lost:,}, only the second {gained:,}"
     return _figure(counts, [_name(outcome, "\n") for outcome in ENDINGS], names[0], names[1], heading)
 
 

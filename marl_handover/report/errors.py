@@ -15,6 +15,7 @@ from marl_handover.report.palette import FAINT, HATCHES, INK, OUTCOMES, PAPER
 from marl_handover.report.table import Axes
 from marl_handover.report.traces import Trace, errors_at_end
 from marl_handover.task.rules import Outcome
+from marl_handover.wording import counted
 
 Floats = NDArray[np.float64]
 
@@ -59,7 +60,7 @@ def errors_figure(trace: Trace, symmetry_order: int = 1, scale: str = "log", tit
     shown = [outcome for outcome in OUTCOMES if (trace.outcome == int(Outcome[outcome.upper()])).any()]
     patches = [Patch(facecolor=OUTCOMES[key], hatch=HATCHES[key], edgecolor=PAPER, label=key.replace("_", " ")) for key in shown]
     figure.legend(handles=patches, loc="outside lower center", ncols=len(patches), fontsize=8, frameon=False)
-    figure.suptitle(f"{title}{': ' if title else ''}error at the end of {len(away_mm):,} episodes", fontsize=10)
+    figure.suptitle(f"{title}{': ' if title else ''}error at the end of {counted(len(away_mm), 'episode')}", fontsize=10)
     return figure
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from marl_handover.errors import CorruptFile
 from marl_handover.report.palette import BLUE, FAINT, GREY, OUTCOMES, PAPER, YELLOW
 from marl_handover.report.table import Axes
+from marl_handover.wording import counted
 
 
 def check_evaluation(result: Mapping[str, Any], path: Path) -> None:
@@ -51,7 +52,9 @@ def evaluation_figure(
         _means(right, result)
     name = Path(str(result["policy"])).name
     kind = f"architecture {result['architecture']}, " if "architecture" in result else ""
-    figure.suptitle(f"policy {name}: {kind}ε = {result['epsilon_deg']:g}°, {sum(result['outcomes'].values()):,} episodes", fontsize=10)
+    figure.suptitle(
+        f"policy {name}: {kind}ε = {result['epsilon_deg']:g}°, {counted(sum(result['outcomes'].values()), 'episode')}", fontsize=10
+    )
     return figure
 
 

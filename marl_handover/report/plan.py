@@ -16,6 +16,7 @@ from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.errors import CorruptFile
 from marl_handover.report.palette import FAINT, GOAL, GREY, INK, arm_colour
 from marl_handover.report.table import Axes, bare, draw_bases, draw_block, draw_sectors, frame_table
+from marl_handover.wording import counted
 
 PANEL_INCHES, LEGEND_INCHES = 2.9, 7.5
 COLUMNS = 4
@@ -98,7 +99,7 @@ def _headline(plan: Mapping[str, Any]) -> str:
     count, optimum = len(plan["transfers"]), plan.get("optimal_transfers")
     compared = "" if optimum is None else f" (optimum {optimum})"
     outcome = str(plan["outcome"]).replace("_", " ")
-    return f"policy {plan['policy']}: {outcome}, {count} transfer{'s' if count > 1 else ''}{compared}"
+    return f"policy {plan['policy']}: {outcome}, {counted(count, 'transfer')}{compared}"
 
 
 def _legend() -> list[Line2D]:

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from marl_handover import policies
 from marl_handover.config import (
@@ -31,6 +30,7 @@ from marl_handover.learning.evaluation import Evaluation, decision_time, evaluat
 from marl_handover.learning.rollout import Decision, Episodes
 from marl_handover.learning.trace import Trace
 from marl_handover.policies import SupervisorPolicy
+from marl_handover.progress import Bar
 from marl_handover.runtime.paths import PathLengths
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Rules
@@ -167,8 +167,8 @@ def _problems(config: AssessmentConfig, rules: Rules) -> tuple[Floats, Floats]:
     return read_problems(rules, Path(config.problems)) if config.problems else random_problems(rules, config.episodes, config.seed)
 
 
-def _bar(problems: tuple[Floats, Floats], progress: bool) -> tqdm[Any]:
-    return tqdm(total=len(problems[0]), unit="episode", disable=not progress, leave=False)
+def _bar(problems: tuple[Floats, Floats], progress: bool) -> Bar:
+    return Bar(total=len(problems[0]), unit="episode", shown=progress, leave=False)
 
 
 def backend_options(config: AssessmentConfig) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.runtime.events import FAULTS, Event
+from marl_handover.wording import counted
 
 STARTING, LOOKING, DECIDING, MOVING, PAUSED, BETWEEN = "starting", "looking", "deciding", "moving", "paused", "between episodes"
 """What a session that goes on may be doing, besides waiting for something that is wrong to pass."""
@@ -121,7 +122,7 @@ class Digest:
     def _ended(self, row: dict[str, Any]) -> None:
         self.ended += 1
         self.solved += row["ended"] == "success"
-        self.text = f"episode {self.episode} ended: {row['ended']} after {row['transfers']} transfers"
+        self.text = f"episode {self.episode} ended: {row['ended']} after {counted(row['transfers'], 'transfer')}"
 
     def _recovered(self, row: dict[str, Any]) -> None:
         self.text = f"{row['what'].replace('_', ' ')} is over"

@@ -159,6 +159,6 @@ class Session:
 def transfer_line(transfer: Transfer) -> str:
     """A transfer for people."""
     order, done = transfer.order, transfer.done
-    where = "the goal" if order.final else f"({order.place_mm[0]:.0f}, {order.place_mm[1]:.0f})"
-    came = done.refusal or f"({done.pose[0]:.1f}, {done.pose[1]:.1f}) mm, {np.degrees(done.pose[2]):.1f} deg"
+    where = "the goal" if order.final else f"({order.place_mm[0]:z.0f}, {order.place_mm[1]:z.0f})"
+    came = done.refusal or f"({done.pose[0]:z.1f}, {done.pose[1]:z.1f}) mm, {np.degrees(done.pose[2]):z.1f} deg"
     return f"  {ARM_LETTERS[order.arm]} to {where}: {came}"

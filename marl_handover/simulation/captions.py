@@ -82,7 +82,7 @@ def _deed(caption: Caption) -> str:
 
 def _distance(caption: Caption) -> str:
     degrees = round(math.degrees(caption.turned_rad), 1) + 0.0  # no -0.0
-    return f"to the goal: {caption.away_mm:.1f} mm, {degrees:+.1f}°"
+    return f"to the goal: {caption.away_mm:.1f} mm, {degrees:+z.1f}°"
 
 
 def _badge(draw: ImageDraw.ImageDraw, right: tuple[float, float], words: str, colour: str, letter: int) -> None:

@@ -13,6 +13,7 @@ from marl_handover.palette import ALERT, BLUE, GREY, INK, PAPER, YELLOW
 from marl_handover.runtime.events import FAULTS
 from marl_handover.runtime.feed import Reading
 from marl_handover.viewer.words import DOING
+from marl_handover.wording import counted
 
 RESTING = {"armed": "holds"}
 """What an arm does that does not move, by the driver's state; else that itself."""
@@ -60,7 +61,7 @@ def facts(state: Mapping[str, Any]) -> str:
     rows = [("session", f"{state.get('hardware', '?')}, policy {state.get('policy', '?')}{', dry run' if state.get('dry_run') else ''}")]
     if totals and episode:
         rows.append(("episode", _progress(episode, ended=bool(state["over"]) or totals["episodes"] > episode["number"])))
-        rows.append(("solved", f"{totals['solved']} of {totals['episodes']}; {totals['transfers']} transfers"))
+        rows.append(("solved", f"{totals['solved']} of {totals['episodes']}; {counted(totals['transfers'], 'transfer')}"))
     block = state.get("block") or {}
     if block.get("pose"):
         sure = "" if block["confidence"] is None else f", confidence {block['confidence']:.2f}"
@@ -70,7 +71,7 @@ def facts(state: Mapping[str, Any]) -> str:
     if faults:
         rows.append(("trouble", ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in faults.items())))
     if state["failures"]["count"]:
-        rows.append(("not published", f"{state['failures']['count']} times: {state['failures']['last']}"))
+        rows.append(("not published", f"{counted(state['failures']['count'], 'time')}: {state['failures']['last']}"))
     return _table(rows)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.runtime.interactive.cell import Placement, Snapshot
 from marl_handover.task.rules import Rules
+from marl_handover.wording import counted
 
 Floats = NDArray[np.float64]
 
@@ -52,13 +53,13 @@ def arm_name(arm: int) -> str:
 
 def degrees_words(angle_rad: float) -> str:
     """An angle to a whole degree."""
-    return f"{math.degrees(angle_rad):.0f}°"
+    return f"{math.degrees(angle_rad):z.0f}°"
 
 
 def place_words(position_mm: ArrayLike) -> str:
     """A place on the table to a whole mm, without a minus before 0."""
-    x_mm, y_mm = np.round(np.asarray(position_mm, float)[:2]) + 0.0
-    return f"({x_mm:.0f}, {y_mm:.0f}) mm"
+    x_mm, y_mm = np.asarray(position_mm, float)[:2]
+    return f"({x_mm:z.0f}, {y_mm:z.0f}) mm"
 
 
 def error_words(rules: Rules, pose: ArrayLike, goal: ArrayLike) -> str:
@@ -80,7 +81,7 @@ def decision_words(rules: Rules, plan: Sequence[Placement], goal: ArrayLike) -> 
     """The next placement, and what the policy expects of its plan in the end."""
     first, last = plan[0], plan[-1]
     where = "to the goal" if first.final else f"to a hand-over at {place_words(first.pose)}"
-    foreseen = f"{error_words(rules, last.pose, goal)} from the goal after {len(plan)} transfer{'s' if len(plan) > 1 else ''}"
+    foreseen = f"{error_words(rules, last.pose, goal)} from the goal after {counted(len(plan), 'transfer')}"
     return f"{arm_name(first.arm)} {where}; foreseen: {foreseen}, {degrees_words(rules.epsilon_rad)} allowed"
 
 

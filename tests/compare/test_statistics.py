@@ -169,5 +169,5 @@ def test_the_first_step_at_a_level(values, level):
 
 def test_without_rliable_one_line_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "rliable", None)
-    with pytest.raises(HandoverError, match=r"pip install .*marl_handover\[compare\]"):
+    with pytest.raises(HandoverError, match=r"pip install .*rliable"):
         summarised(SCORES)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import os
-import termios
 from weakref import WeakKeyDictionary
 
 from serial import PortNotOpenError, SerialException, SerialTimeoutException
@@ -17,6 +16,7 @@ from serial.serialutil import SerialBase
 
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.emulator.device import BITS_PER_BYTE, Device
+from marl_handover.hardware.errors import FlushFailed
 
 SCHEME = "ssc32emu://"
 BUFFER_BYTES = 4096
@@ -135,7 +135,7 @@ class Serial(SerialBase):
     def _require_cable(self) -> None:
         """Raise ``termios.error``, as flushing a port does whose cable came out."""
         if self._gone():
-            raise termios.error(errno.EIO, os.strerror(errno.EIO))
+            raise FlushFailed(errno.EIO, os.strerror(errno.EIO))
 
     def _gone(self) -> bool:
         """Whether the cable came out since the port was opened; a cable that is back needs a fresh open."""

@@ -19,6 +19,7 @@ from marl_handover.runtime.interactive.game import MOST_TRANSFERS, Decider, Plac
 from marl_handover.runtime.interactive.paths import FreePaths
 from marl_handover.runtime.interactive.programs import Programs
 from marl_handover.task.problems import sample_problems
+from marl_handover.wording import counted
 
 Floats = NDArray[np.float64]
 
@@ -143,7 +144,7 @@ class Engine:
         self.transfers += 1
         self._previous, self.plan = order.arm, self.plan[1:]
         if self.decider.there(order.predicted, self.goal):
-            self._conclude(DONE, f"at the goal after {self.transfers} transfers, optimum {self.optimal}")
+            self._conclude(DONE, f"at the goal after {counted(self.transfers, 'transfer')}, optimum {self.optimal}")
         else:
             self.message = f"{ARM_LETTERS[order.arm]} has put the block down"
 
@@ -232,7 +233,7 @@ class Engine:
         order = self._order
         self.plan = self.decider.rollout(self.body.pose, self.goal, self._previous, order)
         if order is not None and not self.ended:
-            what = "to the goal" if order.final else f"to ({order.place_mm[0]:.0f}, {order.place_mm[1]:.0f}) mm"
+            what = "to the goal" if order.final else f"to ({order.place_mm[0]:z.0f}, {order.place_mm[1]:z.0f}) mm"
             self.message = f"{ARM_LETTERS[order.arm]} takes the block {what}"
 
 
