@@ -18,33 +18,32 @@ from marl_handover.hardware.emulator.board import Board
 from marl_handover.hardware.emulator.device import Device
 from marl_handover.hardware.emulator.pty import PtyEmulator
 from marl_handover.hardware.latch import StopLatch
+from marl_handover.requirements import CORE, by_extra, name_of, requirements
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 
 
-def names(requirements) -> tuple[str, ...]:
-    return tuple(Requirement(line).name for line in requirements)
-
-
-def test_every_requirement_is_looked_for():
-    assert names(PROJECT["dependencies"]) == doctor.CORE
-    assert {extra: names(lines) for extra, lines in EXTRAS.items()} == doctor.EXTRAS
+def test_every_requirement_is_looked_for_under_its_name():
+    needed = requirements()
+    assert needed == {CORE: tuple(PROJECT["dependencies"]), **{extra: tuple(lines) for extra, lines in EXTRAS.items()}}
+    for line in (line for lines in needed.values() for line in lines):
+        assert name_of(line) == Requirement(line).name
 
 
 def test_an_installed_packages_metadata_says_the_same_as_the_checkout():
     metadata = [*PROJECT["dependencies"], "tomli>=2; python_version < '3.11'"]
     metadata += [f"{line}; extra == '{extra}'" for extra, lines in EXTRAS.items() for line in lines]
-    core, extras = doctor._sorted_out(metadata)
-    assert core == (*doctor.CORE, "tomli")
-    assert extras == doctor.EXTRAS
+    found, needed = by_extra(metadata), requirements()
+    assert found == {**needed, CORE: (*needed[CORE], "tomli>=2")}
 
 
 def test_packages_of_an_extra_that_are_missing_are_named_with_the_line_that_installs_them(monkeypatch, capsys):
-    monkeypatch.setattr(doctor, "EXTRAS", {"more": ("numpy", "no-such-package")})
+    monkeypatch.setattr(doctor, "requirements", lambda: {CORE: (), "more": ("numpy", "no-such-package>=3")})
+    monkeypatch.setattr(doctor, "install_line", lambda extra: f"the line for {extra}")
     doctor.run(doctor.DoctorConfig())
     assert "[more]" in (out := capsys.readouterr().out)
-    assert "missing no-such-package; run: pip install 'marl_handover[more]'" in out
+    assert "missing no-such-package; run: the line for more" in out
 
 
 @pytest.fixture
