@@ -86,7 +86,7 @@ def bounded(
     """
     made = default() if callable(default) else default
     whole = isinstance(low, int) and isinstance(high, int) and not any(isinstance(value, float) for value in _leaves(made))
-    return _field(default, Bounds(low, high, whole, length=length or _GENERAL.length, inner=inner or _GENERAL.inner, items=items))
+    return _field(default, Bounds(low, high, whole, length=length or _GENERAL.length, inner=inner or _NO_LISTS, items=items))
 
 
 def chosen(default: Any, choices: Sequence[Any]) -> Any:

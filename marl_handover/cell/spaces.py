@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from marl_handover.config import CellConfig, require_at_least, require_positive
+from marl_handover.config import CellConfig, check_bounds, require_at_least
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
@@ -17,6 +17,8 @@ from marl_handover.geometry.closed_form import Bools, Floats
 from marl_handover.geometry.se2 import SE2
 
 LENGTH_TOLERANCE_MM = 1e-6
+MOST_POINTS = 10**6
+"""Of a grid; the paper cell has 39 thousand."""
 ANGLE_TOLERANCE_RAD = 1e-9
 
 
@@ -77,8 +79,8 @@ def manipulation_grid(arm: ArmModel, cell: CellConfig, bases: Sequence[SE2]) -> 
 
     Raises :class:`InvalidSetting` if ``grid_mm`` is not above 0 or ``pick_height_mm`` is not a finite number of at least 0.
     """
-    require_positive("grid_mm", cell.grid_mm)
-    require_at_least("pick_height_mm", cell.pick_height_mm, 0)
+    check_bounds(cell)
+    _require_moderate(arm, cell, bases)
     axes: list[Floats] = []
     for axis in range(2):
         low = math.floor((min(base.position_mm[axis] for base in bases) - arm.reach_mm) / cell.grid_mm)
@@ -89,6 +91,16 @@ def manipulation_grid(arm: ArmModel, cell: CellConfig, bases: Sequence[SE2]) -> 
     for array in (*axes, masks):
         array.setflags(write=False)
     return ManipulationGrid(axes[0], axes[1], masks, tuple(bases), float(cell.pick_height_mm))
+
+
+def _require_moderate(arm: ArmModel, cell: CellConfig, bases: Sequence[SE2]) -> None:
+    """Raise for a grid of more than :data:`MOST_POINTS` points."""
+    places = np.array([(base.x_mm, base.y_mm) for base in bases])
+    sides_mm = np.ptp(places, axis=0) + 2 * arm.reach_mm
+    least_mm = math.sqrt(sides_mm[0] * sides_mm[1] / MOST_POINTS)
+    if cell.grid_mm < least_mm:
+        limit = f"at least {least_mm:.3g} for these arms, which reach {arm.reach_mm:.4g} mm: the grid has at most {MOST_POINTS} points"
+        raise InvalidSetting("grid_mm", cell.grid_mm, limit)
 
 
 def fit_annulus(grid: ManipulationGrid, rounding_mm: float = 0.0, weight: float = 1000.0) -> AnnulusFit:

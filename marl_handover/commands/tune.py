@@ -73,10 +73,12 @@ def run(config: TuneConfig) -> int:
 
 def _search(config: TuneConfig) -> tuple[Search, Path]:
     """What to do, checked, and the folder for it."""
+    from marl_handover.cell import build_cell
     from marl_handover.compare.tune import Search
     from marl_handover.compare.tune_space import load_space
     from marl_handover.compare.tune_storage import located
     from marl_handover.compose_schema import option_file
+    from marl_handover.learning.trainer import usable_device
 
     check_bounds(config)
     if config.address and config.launcher == "loky":
@@ -85,6 +87,8 @@ def _search(config: TuneConfig) -> tuple[Search, Path]:
         raise InvalidSetting("resume", config.resume, "left empty; a study continues by itself")
     settings = TrainConfig(**{item.name: getattr(config, item.name) for item in fields(TrainConfig)})
     deepcopy(settings).validate()  # which fills in what follows from the rest, and a trial may change that
+    usable_device(settings.device)
+    build_cell(settings.cell)
     name = config.study or config.algorithm.name
     out = Path(config.out or f"runs/tune/{name}")
     if out.exists() and not out.is_dir():

@@ -16,8 +16,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from marl_handover.compare.suite_check import MAX_SEEDS, RUN, check
 from marl_handover.compose_schema import option_file
-from marl_handover.config import bounded, require_between, require_choice
-from marl_handover.errors import CorruptFile, HandoverError, UnknownChoice
+from marl_handover.config import bounded, check_bounds, require_between, require_choice
+from marl_handover.errors import CorruptFile, HandoverError, InvalidSetting, UnknownChoice
 from marl_handover.parsing import read_yaml
 from marl_handover.resources import resource_path
 
@@ -207,9 +207,12 @@ def _fitted(schema: type[Spec], tree: Any, path: Path, where: str, also: Iterabl
         if key not in known:
             raise CorruptFile("suite", path, f"{where}: unknown key {key!r}; keys: {', '.join([*known, *also])}")
     try:
-        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.create(dict(tree))))  # type: ignore[return-value]
-    except OmegaConfBaseException as error:
+        made: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.create(dict(tree))))
+        check_bounds(made)
+    except (OmegaConfBaseException, InvalidSetting) as error:
         raise CorruptFile("suite", path, f"{where}: {str(error).splitlines()[0]}") from error
+    fitted: Spec = made
+    return fitted
 
 
 def _applies(spec: EvaluationSpec, row: RowSpec) -> bool:

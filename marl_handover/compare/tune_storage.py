@@ -114,7 +114,10 @@ def located(storage: str, folder: Path) -> str:
         return storage
     if re.match(r"\w+:", storage):
         raise StorageUnavailable(storage, "is neither a URL, such as postgresql://user:password@host/name, nor the path of a journal file")
-    return str(expanded(storage or folder / "study.journal").absolute())
+    path = expanded(storage or folder / "study.journal").absolute()
+    if path.exists() and not path.is_file():
+        raise StorageUnavailable(storage, "is no regular file, which a journal is")
+    return str(path)
 
 
 def open_storage(storage: str) -> BaseStorage:

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-from marl_handover.errors import MissingFile, UrdfError
+from marl_handover.errors import UrdfError
+from marl_handover.files import MEGABYTE, read_bounded
 
 ARM_JOINTS = ("base_yaw", "shoulder", "elbow", "wrist_pitch", "wrist_roll")
 """Names of an arm's joints, from the base on; the order of every joint vector."""
@@ -24,6 +25,9 @@ _MM = 1000.0
 _NUMBERS = {"xyz", "rpy", "size", "radius", "length", "lower", "upper", "effort", "velocity", "value"}
 _NUMBERS |= {"ixx", "ixy", "ixz", "iyy", "iyz", "izz"}
 _MOVABLE = ("revolute", "continuous", "prismatic")
+
+MOST_ELEMENTS, LARGEST = 1000, 1e6
+"""What a file may have: so many links and joints, and no number beyond, whatever its unit."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +105,10 @@ def read_urdf(path: Path | str, grasp_link: str = "grip") -> ArmDescription:
     Raises :class:`MissingFile` if there is no such file, and :class:`UrdfError`, which names the fault, for anything else wrong with it.
     """
     path = Path(path)
-    if not path.is_file():
-        raise MissingFile("URDF", path)
     robot = _parse(path)
     _refuse_non_finite(path, robot)
+    if len(robot) > MOST_ELEMENTS:
+        _fail(path, f"it has {len(robot)} links and joints; it may have {MOST_ELEMENTS}")
     links = tuple(Link(_attribute(path, e, "name", "a link"), _collisions(path, e)) for e in robot.findall("link"))
     names = [link.name for link in links]
     joints = tuple(_joint(path, element) for element in robot.findall("joint"))
@@ -128,11 +132,9 @@ def _fail(path: Path, problem: str) -> NoReturn:
 def _parse(path: Path) -> ET.Element:
     # Decoding first keeps another encoding from hiding a declaration from the check below.
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        text = read_bounded(path, 16 * MEGABYTE, "URDF").decode("utf-8-sig")
     except UnicodeDecodeError:
         raise UrdfError(path, "is not UTF-8 text") from None
-    except OSError as error:
-        raise UrdfError(path, f"cannot be read: {error.strerror}") from None
     if re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
         _fail(path, "declares a DOCTYPE or an entity, which is refused; remove the declaration")
     try:
@@ -171,6 +173,8 @@ def _numbers(path: Path, element: ET.Element, name: str) -> tuple[float, ...]:
         raise UrdfError(path, f"<{element.tag} {name}={text!r}> is not a number") from None
     if not values or not all(math.isfinite(value) for value in values):
         _fail(path, f"<{element.tag} {name}={text!r}>: every number must be finite")
+    if any(abs(value) > LARGEST for value in values):
+        _fail(path, f"<{element.tag} {name}={text!r}>: no number may be beyond {LARGEST:g}")
     return values
 
 
@@ -243,6 +247,8 @@ def _joint(path: Path, element: ET.Element) -> Joint:
     lower, upper, velocity = (scale * _scalar(path, limit, key, f"the <limit> of {where}") for key in ("lower", "upper", "velocity"))
     if lower > upper:
         _fail(path, f"{where} has a lower limit above its upper limit")
+    if velocity <= 0:
+        _fail(path, f"{where} has velocity {velocity:g} in its <limit>; it must be above 0")
     effort = _scalar(path, limit, "effort", f"the <limit> of {where}")
     unit = (axis[0] / length, axis[1] / length, axis[2] / length)
     return Joint(name, kind, parent, child, xyz_mm, rpy_rad, unit, lower, upper, effort, velocity)

@@ -305,7 +305,9 @@ def usable_device(name: str) -> torch.device:
     try:
         device = torch.device(name)
         torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
+        if device.type not in ("cpu", "cuda"):
+            raise RuntimeError(f"nothing here computes on {device.type}")
+    except (RuntimeError, AssertionError, ValueError) as error:
         found = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
         raise InvalidSetting("device", name, f"one this machine has: {', '.join(found)}") from error
     return device

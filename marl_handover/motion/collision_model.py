@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
 from marl_handover.config import BlockConfig, MotionConfig
+from marl_handover.errors import UrdfError
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.capsules import Capsule, capsule_pairs, joints_before
 from marl_handover.geometry.kernels import can_meet, world_shapes
@@ -83,6 +84,8 @@ def arm_collision_model(model: CellModel, motion: MotionConfig) -> CollisionMode
     arm = model.arm
     planar = arm.planar
     shapes, first, second = capsule_pairs(arm.description)
+    if not shapes:
+        raise UrdfError(arm.description.path, "no link has a collision shape, and motions need them")
     pivots = np.array([[0.0, 0.0], [0.0, 0.0], arm.shoulder_mm, arm.shoulder_mm + arm.upper_arm_mm])
     pivots = np.concatenate([pivots, [pivots[3] + arm.forearm_mm]])
     frames = arm.link_transforms(np.zeros(5), motion.finger_travel_mm)
