@@ -1,7 +1,7 @@
 # Needs Linux, make and Python 3.11 (or 3.12) with venv and pip; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow check format bench docs pretrained wheel clean
+.PHONY: help demo test test-slow fuzz check format bench docs pretrained wheel clean
 
 SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
 PYTHON ?= $(firstword $(foreach p,python3.11 python3 python3.12,$(shell $(p) -c "$(SUITABLE)" 2>/dev/null && echo $(p))))
@@ -15,6 +15,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 help:
 	@echo "make demo       install, train a supervisor, evaluate it against the exact planner, leave pictures in runs/"
 	@echo "make test       install and run the tests; make test-slow the slow ones (wheel, SIGKILL, longer learners)"
+	@echo "make fuzz       20,000 random command lines over every key of every command, in one process (an hour or two)"
 	@echo "make check      style, types and import layers; make format repairs the style"
 	@echo "make bench      measure motion planning, speed, and learning against Stable-Baselines3 (hours)"
 	@echo "make docs       build the documentation site into site/; warnings are errors"
@@ -42,6 +43,9 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) -m "slow and not gpu and not hardware"
+
+fuzz: $(STAMP)
+	$(ONE_THREAD) $(BIN)/python tests/fuzz_command_lines.py 20000
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -36,7 +36,7 @@ from marl_handover.resources import resource_path
 
 __all__ = ["compose", "from_text", "from_yaml", "keys_help", "to_yaml"]
 
-LONGEST_ARGUMENT = 10_000
+LONGEST_ARGUMENT = 5000
 """Characters of a ``key=value``: Hydra's parser takes its time over long ones, and text is at most 4096."""
 
 _KEY = re.compile(r"[A-Za-z_]\w*(\.[\w-]+)*")

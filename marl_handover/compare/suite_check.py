@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING
 
-from marl_handover.config import require_at_least, require_between, require_choice
+from marl_handover.config import require_at_least, require_choice
 from marl_handover.errors import HandoverError
 from marl_handover.policies.shielded import SHIELDED
 
@@ -67,8 +67,6 @@ class BadEntry(HandoverError):
 
 def check(suite: Suite) -> None:
     """Raise a :class:`HandoverError` that names the first entry that cannot be meant."""
-    require_between("seeds", suite.seeds, 1, MAX_SEEDS)
-    require_between("quick.seeds", suite.quick.seeds, 1, MAX_SEEDS)
     require_at_least("number of rows", len(suite.rows), 1)
     for what in ("rows", "evaluations", "figures", "tables"):
         names: list[str] = []
@@ -95,7 +93,6 @@ def check(suite: Suite) -> None:
 
 
 def _check_row(row: RowSpec) -> None:
-    require_between(f"seeds of {row.name}", row.seeds, 0, MAX_SEEDS)
     if (row.train is None) == (not row.policy):
         raise BadEntry(f"rows: {row.name}", "give `train`, a list that may be empty, or `policy`, one of the two")
     if RUN in row.policy:
@@ -105,7 +102,6 @@ def _check_row(row: RowSpec) -> None:
 def _check_evaluations(suite: Suite) -> None:
     rows = tuple(row.name for row in suite.rows)
     for spec in suite.evaluations:
-        require_between(f"seeds of {spec.name}", spec.seeds, 0, MAX_SEEDS)
         if spec.name in RECORDS:
             raise BadEntry(f"evaluations: {spec.name}", f"a run's own records are called so; any name but {', '.join(RECORDS)}")
         for name in spec.rows:
