@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import CellConfig, CentralisedConfig, MotionConfig, TaskConfig
-from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, MissingFile, UnknownChoice, first_line
+from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, MissingFile, UnknownChoice, first_line
 from marl_handover.files import expanded
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.parsing import parse_object
@@ -49,7 +49,10 @@ def load(
         UnknownChoice, MissingFile, CorruptFile, CheckpointMismatch: if there is no such policy or its file is not whole.
     """
     if name.startswith(SHIELDED):
-        return ShieldedPolicy(load(name.removeprefix(SHIELDED), cell, task, seed, motion=motion))
+        inner = name.removeprefix(SHIELDED)
+        if inner.startswith(SHIELDED):
+            raise InvalidSetting("policy", name, f"shielded once, {SHIELDED}NAME")
+        return ShieldedPolicy(load(inner, cell, task, seed, motion=motion))
     if name in BASELINES:
         rules = _rules(cell or load_cell(), task or TaskConfig(), motion)
         made = {"exact": ExactPolicy, "greedy": GreedyPolicy}

@@ -44,7 +44,7 @@ LINES = [
     (["workspace", "cell=loop.yaml"], "contains itself"),
     (["compare", "suite=./laughs.yaml", "out=o"], "aliases"),
     (["evaluate", "episodes=1e12"], "episodes = 1000000000000"),
-    (["evaluate", "policy=" + "shielded:" * 400 + "exact"], "policy"),
+    (["evaluate", "policy=" + "shielded:" * 400 + "exact"], "shielded once"),
     (["evaluate", "problems=deep.jsonl"], "line 1"),
     (["plot", "kind=errors", "trace=deep.jsonl", "out=p.png"], "line 1"),
     (["plot", "kind=errors", "trace=digits.jsonl", "out=p.png"], "line 1"),
