@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.hardware.clearance import alone_mm, arm_shapes, between_mm
+from marl_handover.hardware.clearance import FAR_MM, alone_mm, arm_shapes, between_mm, still
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.emulator.board import FRAME_S
 from marl_handover.hardware.settings import ARMS
@@ -89,11 +89,11 @@ class LimitWatch:
         self._over("true joint, rad", float(np.maximum(self._lower - true, true - self._upper).max()), TRUE_RAD)
 
     def _room(self, what: str, joints: Floats, table_mm: float, apart_mm: float) -> None:
-        out = np.empty(2)
+        gaps = np.empty(3)
         for row in joints:
-            alone_mm(row[None], self._shapes, out)
-            self._over(f"{what} plane, mm below", -float(out[0]), -table_mm)
-        gap = between_mm(joints[:1], joints[1:2], True, self._shapes, self._bases[0], self._bases[1])
+            alone_mm(still(row), self._shapes, np.full(3, FAR_MM), gaps)
+            self._over(f"{what} plane, mm below", -float(gaps[0]), -table_mm)
+        gap = between_mm(still(joints[0]), still(joints[1]), True, self._shapes, self._shapes, *self._bases, FAR_MM)
         self._over(f"{what} arm to arm, mm nearer", -gap, -apart_mm)
 
     def _speed(self, speed_rad_s: Floats) -> None:

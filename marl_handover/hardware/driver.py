@@ -195,9 +195,12 @@ class ArmDriver(MovingSession):
         return Sent(lines, self._stood_for(wanted, commands), period_s)
 
     def _drive_parked(self, commands: Sequence[JointCommand]) -> Sent:
-        """From where the boards hold the arms, in short moves that the gate sees, after a look at the whole way."""
+        """From where the boards hold the arms, in short moves that the gate sees, after a look at the whole ways.
+
+        Each arm's against all of the other's: boards do not tell when a servo is stuck, and then one arm moves by itself.
+        """
         self._restate()
-        self.gate.check_room({command.arm: self.gate.target(command) for command in commands}, self.clock.now_s())
+        self.gate.check_room({command.arm: self.gate.target(command) for command in commands}, self.clock.now_s(), together=False)
         sent = self._drive(commands, self.config.park_deg_s, State.ARMING)
         self.wait(self.config.stream.settle_s)
         return sent

@@ -2,13 +2,19 @@
 
 It stands below planning and trusts none of it. It models where the arms have been sent, by time, and judges each command from there:
 numbers, joint limits, pulses, age, step, speed, and the room swept on the way: table, the arm itself, the other arm.
+
+What is promised of that room: nowhere on the way of a command that passed, between samples too, is an arm nearer to the table, to itself
+or to the other arm than ``table_clearance_mm``, ``self_clearance_mm`` and ``arm_clearance_mm``, less 0.1 mm. A hand that is closed is
+taken to hold the block, since nothing says that it is empty. The block and its pin keep the same distances, but for the table, on which
+the block stands when it is taken and set down: its lowest point, in whatever way it is turned about the pin, is nowhere lower than
+``block_dip_mm`` under the table, less 0.1 mm. Aims that take out the play of servos are that much below what is meant.
 """
 
 from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from numbers import Integral, Real
 from typing import Any, NamedTuple
 
@@ -20,16 +26,16 @@ from marl_handover.errors import WorkFailed
 from marl_handover.geometry.arm_model import LIMIT_TOLERANCE_RAD
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration
-from marl_handover.hardware.clearance import alone_mm, arm_shapes, between_mm
+from marl_handover.hardware.clearance import FAR_MM, alone_mm, arm_shapes, between_mm, still
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 
 Floats = NDArray[np.float64]
 
-SWEEP_RAD = math.radians(2.0)
-"""The room swept by a command is looked at in steps of at most this much of any joint: under 11 mm at the hand's farthest."""
-
 LAG_S = 0.05
 """Boards may be behind what they were sent by this much: two frames, and the line's own time."""
+
+GRASP_MM = 1.0
+"""Each finger this far from the pin may hold it yet: zeros of grippers are no better known."""
 
 _ROUNDING = 1e-6
 _ANGLES = (*ARM_JOINTS, "fingers")
@@ -72,18 +78,27 @@ class JointCommand(NamedTuple):
 
 
 class _Held(NamedTuple):
-    """A move that was sent: from where to where (joints and fingers, 6), and when."""
+    """A move that was sent: from where to where (joints and fingers, 6), and when; and where the arm was :data:`LAG_S` before it."""
 
+    before: Floats
     start: Floats
     target: Floats
     begin_s: float
     end_s: float
 
     def at(self, t_s: float) -> Floats:
-        if t_s >= self.end_s or self.end_s <= self.begin_s:
+        if t_s < self.begin_s:
+            return self.start + min((self.begin_s - t_s) / LAG_S, 1.0) * (self.before - self.start)
+        if t_s >= self.end_s:
             return self.target
-        share = max(t_s - self.begin_s, 0.0) / (self.end_s - self.begin_s)
-        return self.start + share * (self.target - self.start)
+        return self.start + (t_s - self.begin_s) / (self.end_s - self.begin_s) * (self.target - self.start)
+
+    def way(self, now_s: float, aim: Floats | None) -> Floats:
+        """All that the arm may still do, as a way (3, 6) of :mod:`~marl_handover.hardware.clearance`, if it is sent to ``aim`` (6,) now."""
+        late = self.at(now_s - LAG_S)
+        if aim is None and now_s - LAG_S >= self.begin_s:
+            return np.array([late, late, self.target])
+        return np.array([self.at(now_s), late, self.target if aim is None else aim])
 
 
 class SafetyGate:
@@ -97,7 +112,9 @@ class SafetyGate:
 
     def __init__(self, model: CellModel, config: HardwareConfig, calibrations: Sequence[ArmCalibration]) -> None:
         self.limits, self.calibrations = config.gate, tuple(calibrations)
-        self._arm, self._shapes = model.arm, arm_shapes(model)
+        self._arm, self._shapes = model.arm, (arm_shapes(model), arm_shapes(model, holding=True))
+        self._closed_mm = model.cell.config.block.pin_diameter_mm / 2 + GRASP_MM
+        self._least_mm = np.array([self.limits.table_clearance_mm, self.limits.self_clearance_mm, -self.limits.block_dip_mm])
         self._bases = [np.array([base.x_mm, base.y_mm, base.facing_rad]) for base in model.cell.bases]
         self._pulses = [np.array(config.arms[name].pulse_limits_us, float) for name in ARMS]
         speeds = [model.arm.description.joint(name).velocity for name in ARM_JOINTS]
@@ -105,14 +122,13 @@ class SafetyGate:
         self._speed = np.append(self.speed_rad_s, config.gate.finger_mm_s)
         self._held: list[_Held | None] = [None] * len(self._bases)
         # Compiled, or loaded, here: not between a plan and its first command.
-        still = np.zeros((1, 5))
-        alone_mm(still, self._shapes, np.empty(2))
-        between_mm(still, still, True, self._shapes, self._bases[0], self._bases[0])
+        alone_mm(still(np.zeros(5)), self._shapes[0], np.full(3, -FAR_MM), np.empty(3))
+        between_mm(still(np.zeros(5)), still(np.zeros(5)), True, *self._shapes, self._bases[0], self._bases[0], -FAR_MM)
 
     def refer(self, arm: int, joints_rad: ArrayLike, gripper_mm: float) -> None:
         """Take it that an arm stands still there."""
         where = np.append(np.asarray(joints_rad, float), gripper_mm)
-        self._held[arm] = _Held(where, where, 0.0, 0.0)
+        self._held[arm] = _Held(where, where, where, 0.0, 0.0)
 
     def forget(self) -> None:
         """No arm's position is known any more."""
@@ -160,39 +176,32 @@ class SafetyGate:
             return
         for arm, target in targets.items():
             self._check_ends(arm, target)
-        swept = [targets[arm][None, :5] if arm in targets else None for arm in range(len(self._held))]
-        for arm in targets:
-            self._check_alone(arm, targets[arm][None, :5])
-            self._check_others(arm, swept, targets)
+        ways = [still(targets[arm]) if arm in targets else None for arm in range(len(self._held))]
+        self._check_ways(ways, targets, together=True)
 
     def accept(self, commands: Sequence[JointCommand], duration_s: float, now_s: float) -> None:
         """Commands were sent: take them for what the arms now do."""
         for command in commands:
             target = np.append(np.asarray(command.joints_rad, float), command.gripper_mm)
             held = self._held[command.arm]
-            self._held[command.arm] = _Held(target if held is None else held.at(now_s), target, now_s, now_s + duration_s)
+            start, before = (target, target) if held is None else (held.at(now_s), held.at(now_s - LAG_S))
+            self._held[command.arm] = _Held(before, start, target, now_s, now_s + duration_s)
 
-    def check_room(self, targets: dict[int, Floats], now_s: float) -> None:
+    def check_room(self, targets: dict[int, Floats], now_s: float, *, together: bool = True) -> None:
         """Judge the room swept when arms go straight, in joint angles, from where they are to ``targets`` (each (5,) or longer).
 
-        Arms of one command move together. One that is still in an earlier move may be anywhere on the rest of it at any moment. All may be
-        behind by :data:`LAG_S`.
+        Arms of one command move ``together``; else each may be anywhere on its way while another is anywhere on its own, as arms of
+        which one is stuck. One that is still in an earlier move may be anywhere on the rest of it at any moment. All may be behind by any
+        part of :data:`LAG_S`, those that move together by the same. Fingers that are not named stay as they are.
         """
         ways: list[Floats | None] = []
         for arm, held in enumerate(self._held):
-            if held is None:
-                ways.append(None)
-                continue
-            now, late = held.at(now_s)[:5], held.at(now_s - LAG_S)[:5]
-            aim = targets[arm][:5] if arm in targets else held.target[:5]
-            ways.append(np.array([now, aim, late, aim] if arm in targets else [late, now, now, aim]))
-        longest = max((float(np.abs(way[1::2] - way[::2]).max()) for way in ways if way is not None), default=0.0)
-        share = np.linspace(0.0, 1.0, 1 + math.ceil(longest / SWEEP_RAD))[:, None]
-        swept = [None if way is None else _swept(way, share, arm in targets) for arm, way in enumerate(ways)]
-        for arm, Q in enumerate(swept):
-            if Q is not None and arm in targets:
-                self._check_alone(arm, Q)
-                self._check_others(arm, swept, targets)
+            aim = None
+            if held is not None and arm in targets:
+                aim = held.target.copy()
+                aim[: len(targets[arm])] = targets[arm]
+            ways.append(None if held is None else held.way(now_s, aim))
+        self._check_ways(ways, targets, together)
 
     def _check_times(self, duration_s: float, now_s: float, made_s: float) -> None:
         for name, value in (("the duration", duration_s), ("when it was made", made_s)):
@@ -259,36 +268,50 @@ class SafetyGate:
                 speed, limit, unit = math.degrees(speed), math.degrees(limit), "degrees/s"
             raise GateRejection(Reason.SPEED, arm, f"the speed of {_ANGLES[worst]}", float(speed), f"up to {limit:.1f} {unit}")
 
-    def _check_alone(self, arm: int, Q: Floats) -> None:
-        out = np.empty(2)
-        alone_mm(Q, self._shapes, out)
-        if out[0] < self.limits.table_clearance_mm:
-            limit = f"at least {self.limits.table_clearance_mm:g} mm"
-            raise GateRejection(Reason.TABLE, arm, "the height over the table on the way", float(out[0]), limit)
-        if out[1] < self.limits.self_clearance_mm:
-            limit = f"at least {self.limits.self_clearance_mm:g} mm"
-            raise GateRejection(Reason.ITSELF, arm, "the distance to itself on the way", float(out[1]), limit)
+    def _check_ways(self, ways: Sequence[Floats | None], commanded: Collection[int], together: bool) -> None:
+        """Whether arms may go their ``ways`` (3, 6), None of one that is unknown; those that are ``commanded`` are judged."""
+        for arm in commanded:
+            own = ways[arm]
+            if own is None:
+                raise GateRejection(Reason.NO_REFERENCE, arm, "its position", "unknown", "an arm that was armed in its parked pose")
+            self._check_alone(arm, own)
+            for other, way in enumerate(ways):
+                if other == arm or (other in commanded and other < arm):
+                    continue
+                if way is None:
+                    limit = "arms that were all armed in their parked pose"
+                    raise GateRejection(Reason.NO_REFERENCE, other, "its position", "unknown", limit)
+                self._check_pair(arm, own, other, way, together and other in commanded)
 
-    def _check_others(self, arm: int, swept: Sequence[Floats | None], targets: dict[int, Floats]) -> None:
-        own = swept[arm]
-        for other, Q in enumerate(swept):
-            if other == arm or own is None:
-                continue
-            if Q is None:
-                raise GateRejection(Reason.NO_REFERENCE, other, "its position", "unknown", "arms that were all armed in their parked pose")
-            gap = between_mm(own, Q, other in targets, self._shapes, self._bases[arm], self._bases[other])
-            if gap < self.limits.arm_clearance_mm:
-                limit = f"at least {self.limits.arm_clearance_mm:g} mm"
-                raise GateRejection(Reason.OTHER_ARM, arm, "the distance to the other arm on the way", gap, limit)
+    def _holds(self, way: Floats) -> bool:
+        """Whether a hand may hold the block anywhere on a way (3, 6)."""
+        return bool(way[:, 5].min() <= self._closed_mm)
+
+    def _check_alone(self, arm: int, way: Floats) -> None:
+        gaps, holding = np.empty(3), self._holds(way)
+        alone_mm(way, self._shapes[holding], self._least_mm, gaps)
+        found = (
+            (Reason.TABLE, "the height over the table on the way"),
+            (Reason.ITSELF, f"the distance{_with_block(holding)} to itself on the way"),
+            (Reason.TABLE, "the height over the table of the block in its closed hand, on the way,"),
+        )
+        for gap, least, (reason, what) in zip(gaps.tolist(), self._least_mm.tolist(), found, strict=True):
+            if gap < least:
+                raise GateRejection(reason, arm, what, gap, f"at least {least:g} mm")
+
+    def _check_pair(self, arm: int, way: Floats, other: int, other_way: Floats, together: bool) -> None:
+        holding, also, least = self._holds(way), self._holds(other_way), self.limits.arm_clearance_mm
+        shapes, others = self._shapes[holding], self._shapes[also]
+        gap = between_mm(way, other_way, together, shapes, others, self._bases[arm], self._bases[other], least)
+        if gap < least:
+            what = f"the distance{_with_block(holding)} to the other arm{_with_block(also)} on the way"
+            raise GateRejection(Reason.OTHER_ARM, arm, what, gap, f"at least {least:g} mm")
+
+
+def _with_block(holding: bool) -> str:
+    return ", with the block in its closed hand," if holding else ""
 
 
 def _is(value: Any, kind: type) -> bool:
     """Whether ``value`` is a number of that kind; truth values are none."""
     return isinstance(value, kind) and not isinstance(value, bool)
-
-
-def _swept(way: Floats, share: Floats, commanded: bool) -> Floats:
-    """Samples (n, 5) of the two straight pieces of ``way`` (4, 5); a single one of an arm that stands still and is not told to move."""
-    if not commanded and np.ptp(way, axis=0).max() == 0.0:
-        return way[:1].copy()
-    return np.concatenate([start + share * (end - start) for start, end in (way[:2], way[2:])])

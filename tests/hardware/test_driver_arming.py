@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import re
@@ -12,6 +13,8 @@ import pytest
 
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
+from marl_handover.geometry.capsules import ground_clearance_mm
+from marl_handover.hardware.clearance import FAR_MM, arm_shapes, between_mm, still
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.emulator.faults import make_fault
 from marl_handover.hardware.errors import BoardReset, HalfHeld, NotConfirmed, Stopped, WrongState
@@ -88,6 +91,82 @@ def test_parking_has_a_greatest_speed(one_board, speed_deg_s):
     one_board.park_deg_s = speed_deg_s
     with pytest.raises(InvalidSetting, match="park_deg_s"):
         one_board.validate()
+
+
+def put(rig, joints):
+    """Boards hold both arms at ``joints`` (2, 5), wherever they were before; another session, configured, that finds them so."""
+    for name, pulses in rig.driver.wiring.pulses([JointCommand(arm, joints[arm], 12.0) for arm in range(2)]).items():
+        rig.driver.boards.by_name[name].move(pulses, 100)
+    rig.clock.sleep_s(3.0)
+    return again(rig)
+
+
+def jam(rig, arm, jammed):
+    """Whether no servo of an arm moves from now on; nobody is told."""
+    for servo in rig.cell.servos(arm):
+        servo.jammed = jammed
+
+
+def nearest_mm(rig, shapes, bases):
+    """What is filled with the arms' true distance in every frame from now on."""
+    found = []
+
+    def look():
+        q = rig.cell.joints_rad(rig.clock.now_s())
+        found.append(between_mm(still(q[0]), still(q[1]), True, shapes, shapes, *bases, FAR_MM))
+        rig.clock.at(rig.clock.now_s() + 0.02, look)
+
+    rig.clock.at(rig.clock.now_s() + 0.001, look)
+    return found
+
+
+@pytest.mark.parametrize(
+    "start_deg",
+    [
+        [[13.0, 85.0, -111.0, -12.0, 0.0], [-13.0, 96.0, -112.0, 16.0, 0.0]],  # the right one stuck: 26 mm into it
+        [[-18.0, 108.0, -128.0, 24.0, 0.0], [14.0, 58.0, -115.0, 48.0, 0.0]],  # the left one stuck: 18 mm
+    ],
+)
+def test_held_arms_that_clear_each_other_only_if_both_move_are_not_driven(armed, start_deg):
+    """Both go home at once, and no moment brings them together; but a servo that is stuck tells nobody."""
+    rig = armed()
+    driver = put(rig, np.radians(start_deg))
+    before = rig.device.outputs_us(rig.clock.now_s())
+    with pytest.raises(GateRejection) as caught:
+        driver.arm()
+    assert caught.value.reason is Reason.OTHER_ARM
+    rig.clock.sleep_s(1.0)
+    assert np.abs(np.subtract(rig.device.outputs_us(rig.clock.now_s()), before)).max() <= 5.0, "sent where they are held, and nowhere else"
+
+
+def check_stuck(armed, seed, count):
+    """Held anywhere at all, one arm stuck: where arming is not refused the other one reaches its parked pose without touching it."""
+    random, rig = np.random.default_rng(seed), armed()
+    model, arms = rig.driver.model, 0
+    shapes, bases = arm_shapes(model), [np.array([base.x_mm, base.y_mm, base.facing_rad]) for base in model.cell.bases]
+    while arms < count:
+        joints = random.uniform(model.arm.lower_rad + 0.05, model.arm.upper_rad - 0.05, (2, 5))
+        apart = between_mm(still(joints[0]), still(joints[1]), True, shapes, shapes, *bases, FAR_MM)
+        if not 15.0 < apart < 60.0 or ground_clearance_mm(model.arm, joints).min() < 3.0:
+            continue
+        driver, stuck = put(rig, joints), arms % 2
+        jam(rig, stuck, True)
+        found = nearest_mm(rig, shapes, bases)
+        with contextlib.suppress(GateRejection):
+            driver.arm()
+            arms += 1
+            assert np.degrees(np.abs(rig.cell.joints_rad(rig.clock.now_s())[1 - stuck] - driver.parked_rad)).max() < 8.0
+            assert min(found) > 0.0
+        jam(rig, stuck, False)
+
+
+def test_a_stuck_arm_is_not_run_into(armed):
+    check_stuck(armed, 0, 3)
+
+
+@pytest.mark.slow
+def test_a_stuck_arm_is_not_run_into_from_two_hundred_places(armed):
+    check_stuck(armed, 1, 200)
 
 
 def test_held_fingers_open_no_faster_than_the_gate_allows(armed):
