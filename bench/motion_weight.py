@@ -20,8 +20,8 @@ import numpy as np
 from common import ROOT, commit, machine, parse, table
 from tqdm import tqdm
 
+from marl_handover.cell.arm import REACH_TOLERANCE_MM
 from marl_handover.cell.build import build_cell, cell_config
-from marl_handover.cell.cell import REACH_TOLERANCE_MM
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.learning.rollout import Decision, play
 from marl_handover.motion.path_length_table import path_length_table

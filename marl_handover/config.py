@@ -28,6 +28,7 @@ from marl_handover.errors import InvalidSetting
 
 __all__ = [
     "MAX_SEED",
+    "ArmConfig",
     "BlockConfig",
     "CellConfig",
     "CentralisedConfig",
@@ -105,12 +106,24 @@ def _paper_limits() -> dict[str, list[float]]:
 
 
 @dataclass
+class ArmConfig:
+    """Where one arm of a cell stands, and which robot it is."""
+
+    name: str = ""
+    x_mm: float = bounded(0.0, -10_000.0, 10_000.0)
+    y_mm: float = bounded(0.0, -10_000.0, 10_000.0)
+    facing_deg: float = bounded(0.0, -360.0, 360.0)  # world direction of zero yaw
+    robot: str = path_field("")  # a URDF, as for cell.urdf, with its own joint limits; empty: the cell's
+
+
+@dataclass
 class CellConfig:
-    """Two mirrored arms of one URDF around a shared piece of table; the defaults are the paper's cell."""
+    """Arms around a shared piece of table; the defaults are the paper's cell, two mirrored arms of one URDF."""
 
     name: str = "paper"
     urdf: str = path_field("al5a.urdf")  # a path, or the name of a file in urdf/
     grasp_link: str = "grip"
+    arms: list[ArmConfig] = sized(list, 0, 16)  # one entry an arm; empty: a mirrored pair, its bases base_distance_mm apart
     base_distance_mm: float = bounded(360.0, 10.0, 10_000.0)
     pick_height_mm: float = bounded(45.0, 0.1, 1000.0)
     joint_limits_deg: dict[str, list[float]] = bounded(_paper_limits, -360.0, 360.0, (0, 64), (2, 2))  # replace the URDF's, joint by joint

@@ -7,7 +7,7 @@ with ``exit_status``.
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +141,32 @@ class NoSharedSpace(HandoverError):
             f"choose base_distance_mm between {2 * r_min_mm:g} and {2 * r_max_mm:g}"
         )
         super().__init__(f"no connected shared space at base_distance_mm = {base_distance_mm:g}: {because}")
+
+
+class TwoArmsOnly(HandoverError):
+    """Something that is made for two arms was asked of a cell with another number of them."""
+
+    def __init__(self, what: str, names: Sequence[str]) -> None:
+        self.what, self.names = what, tuple(names)
+        super().__init__(f"{what} is for two arms; this cell has {len(self.names)}: {', '.join(self.names)}")
+
+
+class UnequalArms(HandoverError):
+    """Something that is made for arms of one kind was asked of a cell whose arms differ."""
+
+    def __init__(self, what: str, values: Mapping[str, Any]) -> None:
+        self.what, self.values = what, dict(values)
+        listed = ", ".join(f"{name} {value}" for name, value in self.values.items())
+        super().__init__(f"all arms must have the same {what} for this; they have: {listed}")
+
+
+class UnconnectedArms(HandoverError):
+    """Some arms of a cell cannot pass an object to the others, however long the way."""
+
+    def __init__(self, groups: Sequence[Sequence[str]]) -> None:
+        self.groups = [list(group) for group in groups]
+        listed = " and ".join(f"({', '.join(group)})" for group in self.groups)
+        super().__init__(f"the arms fall into groups that share no place: {listed}; stand them nearer to each other, or turn them")
 
 
 class OutOfReach(HandoverError):

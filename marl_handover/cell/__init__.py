@@ -1,16 +1,16 @@
-"""The cell: arms from their URDF, what they reach, the chart of what they share, its symmetries."""
+"""The cell: arms from their URDF, what they reach, what they share and how it is charted, who can pass to whom, its symmetries."""
 
+from marl_handover.cell.arm import Arm
 from marl_handover.cell.build import CellModel, build_cell, cell_config, load_cell
-from marl_handover.cell.cell import Base, Cell
+from marl_handover.cell.cell import Cell
 from marl_handover.cell.chart import Chart
-from marl_handover.cell.symmetry import GROUP, LEFT, NO_ARM, RIGHT, Symmetry
+from marl_handover.cell.symmetry import LEFT, NO_ARM, RIGHT, Symmetry
 
 __all__ = [
-    "GROUP",
     "LEFT",
     "NO_ARM",
     "RIGHT",
-    "Base",
+    "Arm",
     "Cell",
     "CellModel",
     "Chart",

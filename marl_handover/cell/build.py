@@ -2,28 +2,53 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from marl_handover.cell.cell import Cell, mirrored_pair
-from marl_handover.cell.chart import Chart
-from marl_handover.cell.spaces import AnnulusFit, ManipulationGrid, fit_annulus, manipulation_grid
+from marl_handover.cell.arm import Arm, mirrored_pair
+from marl_handover.cell.cell import Cell
+from marl_handover.cell.reach import AnnulusFit, ManipulationGrid, fit_annulus, manipulation_grid
 from marl_handover.compose import from_yaml, to_yaml
 from marl_handover.config import CellConfig, require_choice
-from marl_handover.errors import MissingFile
+from marl_handover.errors import InvalidSetting, MissingFile, UnequalArms
 from marl_handover.files import expanded
+from marl_handover.geometry.capsules import base_radius_mm
 from marl_handover.geometry.closed_form import ClosedFormArm
+from marl_handover.geometry.se2 import SE2
 from marl_handover.geometry.urdf import read_urdf
 from marl_handover.resources import resource_path
 
 
 class CellModel(NamedTuple):
-    """A cell with everything it was computed from."""
+    """A cell with everything it was computed from.
+
+    Attributes:
+        cell: the arms and what they have in common.
+        arms: each arm's kinematics.
+        grid: what each of them reaches, point by point.
+        fits: the annulus sector that stands for it; arms of one robot have one in common.
+    """
 
     cell: Cell
-    arm: ClosedFormArm
+    arms: tuple[ClosedFormArm, ...]
     grid: ManipulationGrid
-    fit: AnnulusFit
+    fits: tuple[AnnulusFit, ...]
+
+    @property
+    def arm(self) -> ClosedFormArm:
+        """The kinematics that all arms have. Raises :class:`UnequalArms` where they differ."""
+        if any(arm is not self.arms[0] for arm in self.arms):
+            raise UnequalArms("robot", {arm.name: arm.robot for arm in self.cell.arms})
+        return self.arms[0]
+
+    @property
+    def fit(self) -> AnnulusFit:
+        """The annulus sector that all arms have. Raises :class:`UnequalArms` where they differ."""
+        if any(fit is not self.fits[0] for fit in self.fits):
+            raise UnequalArms("reach", {arm.name: arm.robot for arm in self.cell.arms})
+        return self.fits[0]
 
 
 def urdf_path(urdf: str) -> Path:
@@ -41,16 +66,53 @@ def build_cell(config: CellConfig) -> CellModel:
     """Compute the cell of ``config``.
 
     Raises:
-        InvalidSetting, MissingFile, UrdfError, NoSharedSpace: where a setting, the URDF or the geometry cannot be.
+        InvalidSetting, MissingFile, UrdfError, NoSharedSpace, UnconnectedArms: where a setting, the URDF or the geometry cannot be.
     """
     config.validate()
-    arm = ClosedFormArm(read_urdf(urdf_path(config.urdf), config.grasp_link), config.joint_limits_deg)
-    bases = mirrored_pair(config.base_distance_mm)
-    grid = manipulation_grid(arm, config, bases)
-    fit = fit_annulus(grid, config.fit_rounding_mm)
-    Chart(fit.r_min_mm, fit.r_max_mm, config.base_distance_mm, config.chart_inset)
-    cell = Cell(bases, fit.r_min_mm, fit.r_max_mm, (fit.yaw_lower_rad, fit.yaw_upper_rad), config)
-    return CellModel(cell, arm, grid, fit)
+    names, bases, robots, mirrors = _standing(config)
+    models = {robot: _robot(config, robot) for robot in dict.fromkeys(robots)}
+    arms = tuple(models[robot] for robot in robots)
+    _require_apart(names, bases, arms)
+    grid = manipulation_grid(arms, config, bases)
+    fits = {}
+    for robot in models:
+        alike = [index for index, each in enumerate(robots) if each == robot]
+        fits[robot] = fit_annulus(grid, config.fit_rounding_mm, arms=alike)
+    listed = []
+    for name, base, robot, mirror in zip(names, bases, robots, mirrors, strict=True):
+        fit = fits[robot]
+        listed.append(Arm(name, base, fit.r_min_mm, fit.r_max_mm, (fit.yaw_lower_rad, fit.yaw_upper_rad), robot, mirror))
+    return CellModel(Cell(tuple(listed), config), arms, grid, tuple(fits[robot] for robot in robots))
+
+
+def _standing(config: CellConfig) -> tuple[tuple[str, ...], tuple[SE2, ...], tuple[str, ...], tuple[int, ...]]:
+    """Name, base, robot and mirror of each arm."""
+    if not config.arms:
+        return ("left", "right"), mirrored_pair(config.base_distance_mm), (config.urdf, config.urdf), (-1, 1)
+    names = tuple(arm.name for arm in config.arms)
+    for index, name in enumerate(names):
+        if not name or name in names[:index]:
+            raise InvalidSetting(f"cell.arms[{index}].name", name, "a name that no other arm has")
+    if len(names) < 2:
+        raise InvalidSetting("cell.arms", len(names), "two arms at least; without any: a mirrored pair")
+    bases = tuple(SE2.facing_deg(arm.x_mm, arm.y_mm, arm.facing_deg) for arm in config.arms)
+    return names, bases, tuple(arm.robot or config.urdf for arm in config.arms), (1,) * len(names)
+
+
+def _robot(config: CellConfig, robot: str) -> ClosedFormArm:
+    limits = config.joint_limits_deg if robot == config.urdf else {}
+    return ClosedFormArm(read_urdf(urdf_path(robot), config.grasp_link), limits)
+
+
+def _require_apart(names: Sequence[str], bases: Sequence[SE2], arms: Sequence[ClosedFormArm]) -> None:
+    """Raise :class:`InvalidSetting` if a base stands inside another arm's."""
+    for second in range(len(names)):
+        for first in range(second):
+            apart = math.dist(bases[first].position_mm, bases[second].position_mm)
+            least = base_radius_mm(arms[first].description) + base_radius_mm(arms[second].description)
+            if apart < least:
+                what = f"at least {least:.1f} mm from that of {names[first]!r}, whose base stands there"
+                raise InvalidSetting(f"the base of arm {names[second]!r}, {apart:.1f} mm away,", bases[second].position_mm.tolist(), what)
 
 
 def cell_config(name: str) -> CellConfig:

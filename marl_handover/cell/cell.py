@@ -1,6 +1,7 @@
-"""The cell: where the arms stand, what each can reach, and the chart of what they share.
+"""The cell as data: its arms, what each can reach, what they share, and the symmetries of all that.
 
-World frame: origin midway between the bases, +z up, the base line is the y axis; lengths in mm, angles in rad.
+World frame: on the table, +z up; a mirrored pair has its origin midway between the bases, the base line is the y axis. Lengths in mm,
+angles in rad.
 """
 
 from __future__ import annotations
@@ -12,66 +13,112 @@ from typing import Any
 
 import numpy as np
 
-from marl_handover.arrays import Array, namespace
+from marl_handover.arrays import Array, namespace, one_where
+from marl_handover.cell.arm import REACH_TOLERANCE_MM, Arm
 from marl_handover.cell.chart import Chart
+from marl_handover.cell.handover_graph import HandoverGraph
+from marl_handover.cell.shared_space import SharedSpace
+from marl_handover.cell.symmetry import ARM_LETTERS, Symmetry, symmetries
 from marl_handover.config import CellConfig
-from marl_handover.errors import NoSharedSpace
+from marl_handover.errors import TwoArmsOnly, UnconnectedArms, UnequalArms
 from marl_handover.geometry.se2 import SE2
-
-REACH_TOLERANCE_MM = 1e-3
-"""Membership has this tolerance everywhere: at beta = +-1 float32 rounding would put one chart point in ten outside."""
-
-
-@dataclass(frozen=True)
-class Base(SE2):
-    """Where an arm stands; its frame's +x axis is the direction of zero yaw. ``mirror`` is -1 for the arm that is the mirror image."""
-
-    mirror: int
-
-
-def mirrored_pair(base_distance_mm: float) -> tuple[Base, Base]:
-    """Left base at (0, +d/2) facing -y, right base at (0, -d/2) facing +y."""
-    half = base_distance_mm / 2
-    return Base(0.0, half, (0.0, -1.0), -1), Base(0.0, -half, (0.0, 1.0), 1)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Continuous model of the cell: one annulus sector a arm, and the shared chart.
+    """Continuous model of the cell: an annulus sector an arm, and what they have in common.
 
     Attributes:
-        bases: one :class:`Base` an arm, in the order of the arm indices (0 = L, 1 = R).
-        r_min_mm, r_max_mm: radii of the annulus around each base.
-        yaw_rad: (lower, upper) base yaw about each arm's facing.
+        arms: in the order of the arm indices.
         config: the settings the cell was built from.
+
+    Raises:
+        NoSharedSpace: the two arms of a pair have no chart in common.
+        UnconnectedArms: there are arms that cannot pass anything to the others, however long the way.
     """
 
-    bases: tuple[Base, ...]
-    r_min_mm: float
-    r_max_mm: float
-    yaw_rad: tuple[float, float]
+    arms: tuple[Arm, ...]
     config: CellConfig
 
     def __post_init__(self) -> None:
-        tip = math.atan2(self.chart.x_max_mm, self.chart.base_distance_mm / 2)
-        if self.yaw_rad[0] > -tip or self.yaw_rad[1] < tip:
-            raise NoSharedSpace(
-                self.chart.base_distance_mm,
-                self.r_min_mm,
-                self.r_max_mm,
-                f"its tips need a base yaw of +-{math.degrees(tip):.1f} deg, the arm has "
-                f"{math.degrees(self.yaw_rad[0]):.1f} to {math.degrees(self.yaw_rad[1]):.1f} deg",
-            )
+        if self.num_arms == 2:
+            _ = self.chart
+        elif not self.graph.is_connected:
+            raise UnconnectedArms([[self.names[arm] for arm in group] for group in self.graph.components])
 
     @property
     def num_arms(self) -> int:
         """Number of arms."""
-        return len(self.bases)
+        return len(self.arms)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The arms' names."""
+        return tuple(arm.name for arm in self.arms)
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """What traces and pictures call the arms: L and R in a mirrored pair, else by name."""
+        return self.names if self.config.arms else ARM_LETTERS
+
+    @cached_property
+    def bases(self) -> tuple[SE2, ...]:
+        """The arms' base frames."""
+        return tuple(arm.base for arm in self.arms)
+
+    @property
+    def r_min_mm(self) -> float:
+        """The inner radius, where all arms have the same; else raises :class:`UnequalArms`, as the next two do."""
+        return float(self._common("r_min_mm"))
+
+    @property
+    def r_max_mm(self) -> float:
+        """The outer radius that all arms have."""
+        return float(self._common("r_max_mm"))
+
+    @property
+    def yaw_rad(self) -> tuple[float, float]:
+        """The base yaw (lower, upper) that all arms have."""
+        low, high = self._common("yaw_rad")
+        return low, high
+
+    @cached_property
+    def extent_mm(self) -> tuple[float, float]:
+        """How far from the origin, along x and along y, any arm reaches at most."""
+        along_x = max(abs(arm.base.x_mm) + arm.r_max_mm for arm in self.arms)
+        return along_x, max(abs(arm.base.y_mm) + arm.r_max_mm for arm in self.arms)
+
+    @cached_property
+    def graph(self) -> HandoverGraph:
+        """Who can pass to whom."""
+        pairs = [(i, j) for i in range(self.num_arms) for j in range(i + 1, self.num_arms)]
+        spaces = {(i, j): SharedSpace(self.arms[i], self.arms[j], self.config.chart_inset) for i, j in pairs}
+        return HandoverGraph(self.names, {pair: space for pair, space in spaces.items() if self.num_arms == 2 or not space.is_empty})
+
+    @cached_property
+    def symmetries(self) -> tuple[Symmetry, ...]:
+        """The isometries that take the cell onto itself, the identity first."""
+        return symmetries(self.arms, self.graph.edges)
 
     @cached_property
     def chart(self) -> Chart:
-        """The chart of the shared space."""
-        return Chart(self.r_min_mm, self.r_max_mm, self.config.base_distance_mm, self.config.chart_inset)
+        """The chart of what the two arms of a pair share; in any other cell, where each pair has its own, raises :class:`TwoArmsOnly`."""
+        self.require_pair("the one chart of a cell")
+        return self.graph.edges[(0, 1)].chart
+
+    def place_mm(self, arm: Array, receiver: Array, alpha: Array, beta: Array) -> Array:
+        """World position (..., 2) in mm of chart coordinates in what ``arm`` and ``receiver`` (...) share; NaN where they share nothing."""
+        xp = namespace(alpha)
+        place = xp.stack([alpha * math.nan, beta * math.nan], -1)
+        for (i, j), space in self.graph.edges.items():
+            asked = ((arm == i) & (receiver == j)) | ((arm == j) & (receiver == i))
+            place = one_where(asked, space.to_table(alpha, beta), place)
+        return place
+
+    def require_pair(self, what: str) -> None:
+        """Raise :class:`TwoArmsOnly` unless the cell has two arms; ``what`` needs them."""
+        if self.num_arms != 2:
+            raise TwoArmsOnly(what, self.names)
 
     def with_inset(self, chart_inset: float) -> Cell:
         """The same cell with another part of the chart in use."""
@@ -80,17 +127,44 @@ class Cell:
     def polar(self, position_mm: Array) -> tuple[Array, Array]:
         """Squared radius [mm^2] and base yaw [rad] of positions (..., >= 2) seen from each arm, both (..., num_arms)."""
         xp = namespace(position_mm)
-        base_x, base_y, facing_x, facing_y, _ = self._constants(position_mm)
+        base_x, base_y, facing_x, facing_y = self._constants(position_mm)[:4]
         dx, dy = position_mm[..., 0:1] - base_x, position_mm[..., 1:2] - base_y
         forward = facing_x * dx + facing_y * dy
         left = facing_x * dy - facing_y * dx
         return forward * forward + left * left, xp.atan2(left, forward)
 
+    def gripper_yaw(self, yaw_rad: Array) -> Array:
+        """World yaw psi of each gripper, (..., num_arms), from base yaws; not wrapped."""
+        return yaw_rad + self._constants(yaw_rad)[4]
+
+    def within(self, square_mm2: Array, yaw_rad: Array) -> Array:
+        """Whether each arm's squared radius and base yaw, both (..., num_arms), lie in its annulus sector, to 1 um."""
+        low, high, yaw_low, yaw_high = self._constants(square_mm2)[5:]
+        return (square_mm2 >= low) & (square_mm2 <= high) & (yaw_rad >= yaw_low) & (yaw_rad <= yaw_high)
+
+    def reaches(self, position_mm: Array) -> Array:
+        """Which arms can place at positions (..., >= 2): bool (..., num_arms)."""
+        return self.within(*self.polar(position_mm))
+
+    def _common(self, name: str) -> Any:
+        values = [getattr(arm, name) for arm in self.arms]
+        if any(value != values[0] for value in values):
+            raise UnequalArms(name, dict(zip(self.names, values, strict=True)))
+        return values[0]
+
     def _constants(self, like: Array) -> Array:
-        """The bases' x, y, facing vector and facing angle as arrays (5, num_arms) of the kind of ``like``; made once for each kind."""
+        """Facts of the arms as arrays (9, num_arms) of the kind of ``like``, made once for each kind.
+
+        The base's x, y, facing vector and facing angle; least and greatest squared radius and yaw, tolerances included.
+        """
         key = (like.dtype, getattr(like, "device", None))
         if key not in self._kinds:
-            rows = [[base.x_mm, base.y_mm, *base.facing, base.facing_rad] for base in self.bases]
+            rows = []
+            for arm in self.arms:
+                low, high = arm.r_min_mm - REACH_TOLERANCE_MM, arm.r_max_mm + REACH_TOLERANCE_MM
+                slack = REACH_TOLERANCE_MM / arm.r_min_mm
+                sector = [low * low, high * high, arm.yaw_rad[0] - slack, arm.yaw_rad[1] + slack]
+                rows.append([arm.base.x_mm, arm.base.y_mm, *arm.base.facing, arm.base.facing_rad, *sector])
             table = np.array(rows, np.float64).T
             if isinstance(like, (np.ndarray, np.generic)):
                 self._kinds[key] = table.astype(like.dtype)
@@ -101,18 +175,3 @@ class Cell:
     @cached_property
     def _kinds(self) -> dict[Any, Array]:
         return {}
-
-    def gripper_yaw(self, yaw_rad: Array) -> Array:
-        """World yaw psi of each gripper, (..., num_arms), from base yaws; not wrapped."""
-        return yaw_rad + self._constants(yaw_rad)[4]
-
-    def within(self, square_mm2: Array, yaw_rad: Array) -> Array:
-        """Whether squared radius and base yaw lie in the annulus sector, to 1 um; elementwise."""
-        low, high = self.r_min_mm - REACH_TOLERANCE_MM, self.r_max_mm + REACH_TOLERANCE_MM
-        slack = REACH_TOLERANCE_MM / self.r_min_mm
-        in_annulus = (square_mm2 >= low * low) & (square_mm2 <= high * high)
-        return in_annulus & (yaw_rad >= self.yaw_rad[0] - slack) & (yaw_rad <= self.yaw_rad[1] + slack)
-
-    def reaches(self, position_mm: Array) -> Array:
-        """Which arms can place at positions (..., >= 2): bool (..., num_arms)."""
-        return self.within(*self.polar(position_mm))

@@ -76,7 +76,7 @@ class TurnRules(Rules):
 
     def mirror(self, turn: Array, like: Array) -> Array:
         """-1 where arm ``turn`` (...) is the mirrored one, else 1, in the kind of ``like``."""
-        left, right = (base.mirror * namespace(like).ones_like(like) for base in self.cell.bases)
+        left, right = (arm.mirror * namespace(like).ones_like(like) for arm in self.cell.arms)
         return namespace(like).where(turn == 1, right, left)
 
     def command(self, action: Array, turn: Array) -> Command:

@@ -63,17 +63,16 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         self.rules = Rules(cell, task, motion_cost(cell, task))
         self.render_mode = render_mode
         self._view: TopView | None = None
-        reach = float(max(abs(base.x_mm) for base in cell.bases) + cell.r_max_mm + 1.0)
-        reach_y = float(max(abs(base.y_mm) for base in cell.bases) + cell.r_max_mm + 1.0)
-        high = np.array([reach, reach_y, math.pi], dtype=np.float32)
+        reach_x, reach_y = cell.extent_mm
+        high = np.array([reach_x + 1.0, reach_y + 1.0, math.pi], dtype=np.float32)
         pose_space = gymnasium.spaces.Box(-high, high, dtype=np.float32)
-        width = observation_size(task.layout)
+        width = observation_size(task.layout, cell.num_arms)
         self.observation_space = gymnasium.spaces.Dict(
             observation=gymnasium.spaces.Box(-4.0, 4.0, (width,), dtype=np.float32),
             achieved_goal=pose_space,
             desired_goal=gymnasium.spaces.Box(-high, high, dtype=np.float32),
         )
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), dtype=np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.rules.action_size,), dtype=np.float32)
         self._pose = self._goal = np.zeros(3)
         self._previous = np.int64(-1)
         self._transfers = 0

@@ -106,6 +106,7 @@ class HandoverEnv(AECEnv):
         task = task if architecture is None else replace(task, architecture=architecture)
         self.render_mode, self.refused_reward = render_mode, refused_reward
         self.model = cell if isinstance(cell, CellModel) else build_cell(cell_config(cell) if isinstance(cell, str) else cell)
+        self.model.cell.require_pair("the AEC environment")
         if isinstance(backend, str):
             backend = make_backend(backend, self.model, task, motion, **(backend_options or {}))
         self.backend = backend

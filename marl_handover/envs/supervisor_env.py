@@ -57,7 +57,7 @@ class SupervisorEnv(EnvBase):
 
     def _make_specs(self) -> None:
         count, device = self.batch_size[0], self.device
-        width = observation_size(self.rules.config.layout)
+        width = observation_size(self.rules.config.layout, self.rules.cell.num_arms)
         pose = Unbounded(shape=(count, 3), device=device)
         problem = {
             "observation": Unbounded(shape=(count, width), device=device),

@@ -128,6 +128,13 @@ def joints_before(description: ArmDescription) -> dict[str, int]:
     return bodies
 
 
+def base_radius_mm(description: ArmDescription) -> float:
+    """Radius in mm of a disc around the base frame's origin that the root link's shapes stay over."""
+    root = next(link for link in description.links if link.name == description.root)
+    shapes = [enclosing_capsule(root.name, shape) for shape in root.collisions]
+    return max((math.hypot(*end[:2]) + shape.radius_mm for shape in shapes for end in (shape.start_mm, shape.end_mm)), default=0.0)
+
+
 @lru_cache(maxsize=8)
 def capsule_pairs(description: ArmDescription) -> tuple[tuple[Capsule, ...], tuple[int, ...], tuple[int, ...]]:
     """All capsules, and the indices of the pairs that belong to bodies which are not neighbours."""

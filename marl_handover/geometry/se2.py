@@ -21,6 +21,15 @@ class SE2:
     y_mm: float
     facing: tuple[float, float]
 
+    @classmethod
+    def facing_deg(cls, x_mm: float, y_mm: float, angle_deg: float) -> SE2:
+        """The frame that faces a direction in degrees; quarter turns are exact."""
+        quarters = angle_deg / 90.0
+        if quarters == round(quarters):
+            return cls(x_mm, y_mm, ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4])
+        angle = math.radians(angle_deg)
+        return cls(x_mm, y_mm, (math.cos(angle), math.sin(angle)))
+
     @property
     def facing_rad(self) -> float:
         """World direction of the frame's +x axis."""

@@ -36,7 +36,7 @@ class MotionActor(HybridActor):
             last.weight.mul_(0.01)
             last.bias.zero_()
         self.places = [ARM_FIELDS.index(name) for name in ("x", "y", "goal_x", "goal_y")]
-        self.register_buffer("scale", torch.tensor([1.0, cell.bases[0].mirror] * 2) * cell.r_max_mm, persistent=False)
+        self.register_buffer("scale", torch.tensor([1.0, cell.arms[0].mirror] * 2) * cell.r_max_mm, persistent=False)
 
     def positions(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """World positions (n, 2) in mm of object and goal, as observations (n, size) show them."""

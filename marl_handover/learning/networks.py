@@ -160,7 +160,7 @@ class HybridActor(nn.Module):
         if modes > 1 and isinstance(last, nn.Linear):  # start the modes apart, so that they do not learn the same thing
             with torch.no_grad():
                 last.bias[1 + modes : 1 + 3 * modes : 2] = torch.linspace(-0.8, 0.8, modes)
-        self.register_buffer("beta_sign", torch.tensor([float(base.mirror) for base in cell.bases]), persistent=False)
+        self.register_buffer("beta_sign", torch.tensor([float(arm.mirror) for arm in cell.arms]), persistent=False)
 
     def forward(self, observation: Tensor) -> Branches:
         """Branches of observations (n, size) of the ``relative`` layout."""

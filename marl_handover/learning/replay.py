@@ -20,7 +20,6 @@ from torch import Tensor
 from torchrl.data import HERReplayBuffer, LazyTensorStorage
 
 from marl_handover.arrays import one_where, wrap
-from marl_handover.cell.symmetry import GROUP
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.settings import ReplayConfig
 from marl_handover.task.rules import Command, Rules, carried
@@ -217,8 +216,9 @@ class HindsightReplayBuffer(HERReplayBuffer):
         batch["desired_goal"] = one_where(chosen & batch["feasible"][:, 0], goals, batch["desired_goal"])
 
     def _mirror(self, batch: TensorDictBase) -> None:
-        element = torch.randint(len(GROUP), (len(batch),), generator=self.draw, device=batch.device)
-        for number, symmetry in enumerate(GROUP[1:], start=1):
+        group = self.rules.cell.symmetries
+        element = torch.randint(len(group), (len(batch),), generator=self.draw, device=batch.device)
+        for number, symmetry in enumerate(group[1:], start=1):
             rows = element == number
             for key in ("achieved_goal", "desired_goal", "placed"):
                 batch[key] = one_where(rows, symmetry.pose(batch[key]), batch[key])

@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from marl_handover.cell import load_cell
 from marl_handover.compose import to_yaml
 from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, first_line
 from marl_handover.files import remove_temporaries, write_whole
@@ -74,6 +75,7 @@ class Trainer:
         torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
+        load_cell(config.cell).require_pair("training")
         self.variant = make_variant(config.variant)
         self.env = self.variant.env(config, self.device)
         self.rules = self.env.rules

@@ -13,7 +13,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from marl_handover.arrays import one_where
-from marl_handover.cell.symmetry import GROUP
 from marl_handover.envs.decentralised import DecentralisedEnv, TurnRules
 from marl_handover.learning.replay import HindsightReplayBuffer
 from marl_handover.learning.settings import ReplayConfig
@@ -57,7 +56,7 @@ class TurnReplay(HindsightReplayBuffer):
     ) -> None:
         super().__init__(rules, config, env, generator)
         self.to_next_turn, self.separate = to_next_turn, separate
-        self.group = [element for element in GROUP if not (separate and element.mirror_y)]
+        self.group = [element for element in rules.cell.symmetries if not (separate and element.swaps)]
 
     def sample(self, batch_size: int | None = None, return_info: bool = False) -> TensorDict:
         """``batch_size`` decisions drawn uniformly, relabelled, mirrored if the settings say so, and judged at the present epsilon."""
@@ -143,7 +142,7 @@ class TurnReplay(HindsightReplayBuffer):
             for key in ("achieved_goal", "desired_goal", "placed"):
                 batch[key] = one_where(rows, symmetry.pose(batch[key]), batch[key])
             batch["previous_arm"] = one_where(rows, symmetry.arm(batch["previous_arm"]), batch["previous_arm"])
-            if symmetry.mirror_x:
+            if symmetry.chart_signs[(0, 1)][0] < 0:
                 turned = batch["action"] * batch["action"].new_tensor([1.0, -1.0, 1.0])
                 batch["action"] = one_where(rows, turned, batch["action"])
 

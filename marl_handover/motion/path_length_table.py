@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from marl_handover.arrays import Array, namespace, select, wrap
 from marl_handover.cell import Cell, build_cell
+from marl_handover.cell.arm import REACH_TOLERANCE_MM
 from marl_handover.cell.build import urdf_path
-from marl_handover.cell.cell import REACH_TOLERANCE_MM
 from marl_handover.compose import to_yaml
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.errors import CannotWrite, CorruptFile, HandoverError, MissingFile
@@ -162,7 +162,9 @@ def settings_key(cell: Cell, motion: MotionConfig) -> str:
     """
     untimed = {"method", "velocity_share", "acceleration_deg_s2", "sample_s", "grasp_s", "release_s"}
     settings = sorted((name, value) for name, value in asdict(motion).items() if name not in untimed)
-    shape = to_yaml(replace(cell.config, name="", urdf="", chart_inset=1.0))
+    cell.require_pair("a table of path lengths")
+    # A pair says nothing of its arms one by one; keys from before cells could list their arms stay valid.
+    shape = to_yaml(replace(cell.config, name="", urdf="", chart_inset=1.0)).replace("arms: []\n", "")
     digest = hashlib.sha256(repr((RADII, YAWS, DISTANCES, shape, settings)).encode())
     digest.update(urdf_path(cell.config.urdf).read_bytes())
     return digest.hexdigest()[:16]

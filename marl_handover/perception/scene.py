@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from marl_handover.cell.build import CellModel
-from marl_handover.cell.cell import Base
 from marl_handover.config import BlockConfig
 from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.se2 import SE2
 from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.geometry.urdf import Primitive
 from marl_handover.perception.boards import Sheet, block_top, marker_sheet
@@ -63,7 +63,7 @@ def block_shapes(block: BlockConfig, T_world_block: Floats, eye_mm: Floats, top:
     return shapes
 
 
-def arm_shapes(arm: ArmModel, base: Base, joints_rad: ArrayLike, gripper_mm: float | None = None) -> list[Shape]:
+def arm_shapes(arm: ArmModel, base: SE2, joints_rad: ArrayLike, gripper_mm: float | None = None) -> list[Shape]:
     """An arm, as its URDF's collision shapes, at joints (5,); ``gripper_mm``: how far each finger is from closed, None: open."""
     T_world_base = base.matrix()
     frames = arm.link_transforms(np.asarray(joints_rad, dtype=float), gripper_mm)

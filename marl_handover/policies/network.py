@@ -32,7 +32,7 @@ class NetworkPolicy(SupervisorPolicy):
         self.layers = network_layers(arrays, about)
         self.hybrid = about["kind"] == "hybrid"
         self.odd = np.array([-1.0 if field in ODD_FIELDS else 1.0 for field in ARM_FIELDS], np.float32)
-        self.beta_sign = np.array([base.mirror for base in rules.cell.bases], np.float32)
+        self.beta_sign = np.array([arm.mirror for arm in rules.cell.arms], np.float32)
         self.sines = [ARM_FIELDS.index(field) for field in ("sin_hand_over", "sin_finish_error")]
         self.angles = [ARM_FIELDS.index(field) for field in ("cos_finish_error", "cos_hand_over")]
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from marl_handover.cell.build import urdf_path
-from marl_handover.cell.cell import Base
 from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.se2 import SE2
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.simulation.engine import Engine, Floats, Surface, force, length, pybullet, to_mm, torque
 
@@ -36,7 +36,7 @@ class _Servo(NamedTuple):
 class SimulatedArm:
     """An arm in an :class:`Engine`. ``body`` is its number there, ``hand`` and ``fingers`` are link numbers."""
 
-    def __init__(self, engine: Engine, model: ArmModel, base: Base) -> None:
+    def __init__(self, engine: Engine, model: ArmModel, base: SE2) -> None:
         self._engine = engine
         path = urdf_path(str(model.description.path))
         self.body = engine.load_arm(path, base.x_mm, base.y_mm, base.facing_rad)

@@ -1,6 +1,7 @@
 """Named observation layouts: what a policy sees, as one float vector.
 
-``raw`` is the paper's seven numbers. ``relative`` shows the same problem to each arm in its own mirrored frame, so that one network can
+``raw`` is the paper's seven numbers; for N arms the arm that moved last is shown by N numbers, one an arm, instead of one. ``relative``,
+for a pair, shows the same problem to each arm in its own mirrored frame, so that one network can
 serve both arms. ``object`` is ``raw`` without the goal, for goal environments whose goal is a field of its own.
 """
 
@@ -53,10 +54,13 @@ MARGIN_SLOPE = 2.0
 """The margin, 1 for no error, crosses 0 at an error of epsilon with this slope, and ends at -1."""
 
 
-def observation_size(layout: str) -> int:
-    """Length of the layout's vector."""
+def observation_size(layout: str, num_arms: int = 2) -> int:
+    """Length of the layout's vector in a cell of ``num_arms``."""
     require_choice("layout", layout, LAYOUTS)
-    return {"raw": len(RAW_FIELDS), "object": len(OBJECT_FIELDS), "relative": 2 * len(ARM_FIELDS)}[layout]
+    if layout == "relative":
+        return num_arms * len(ARM_FIELDS)
+    previous = 1 if num_arms == 2 else num_arms
+    return len(RAW_FIELDS if layout == "raw" else OBJECT_FIELDS) - 1 + previous
 
 
 def observe(rules: Rules, layout: str, pose: Array, goal: Array, previous_arm: Array, epsilon_rad: Array | float | None = None) -> Array:
@@ -71,36 +75,38 @@ def observe(rules: Rules, layout: str, pose: Array, goal: Array, previous_arm: A
 
 def _scaled(rules: Rules, pose: Array) -> list[Array]:
     """Pose fields scaled to about [-1, 1]."""
-    cell = rules.cell
-    extent_y = cell.r_max_mm + cell.config.base_distance_mm / 2
-    return [pose[..., 0] / cell.r_max_mm, pose[..., 1] / extent_y, pose[..., 2] / math.pi]
+    extent_x, extent_y = rules.cell.extent_mm
+    return [pose[..., 0] / extent_x, pose[..., 1] / extent_y, pose[..., 2] / math.pi]
 
 
-def _previous_sign(rules: Rules, like: Array, previous_arm: Array) -> Array:
-    """-1 for L, +1 for R, 0 for none."""
-    xp = namespace(like)
+def _previous(rules: Rules, like: Array, previous_arm: Array) -> list[Array]:
+    """Which arm moved last: of a pair -1 for L, +1 for R, 0 for none; else one number an arm, 1 for the one that did."""
+    xp, count = namespace(like), rules.cell.num_arms
     one = xp.ones_like(like)
-    return xp.where(previous_arm < 0, 0 * one, xp.where(previous_arm > 0, one, -one))
+    if count == 2:
+        return [xp.where(previous_arm < 0, 0 * one, xp.where(previous_arm > 0, one, -one))]
+    return [xp.where(previous_arm == arm, one, 0 * one) for arm in range(count)]
 
 
 def _raw(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsilon_rad: Array | float) -> Array:
-    fields = [*_scaled(rules, pose), *_scaled(rules, goal), _previous_sign(rules, pose[..., 0], previous_arm)]
+    fields = [*_scaled(rules, pose), *_scaled(rules, goal), *_previous(rules, pose[..., 0], previous_arm)]
     return namespace(pose).stack(fields, -1)
 
 
 def _object(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsilon_rad: Array | float) -> Array:
-    return namespace(pose).stack([*_scaled(rules, pose), _previous_sign(rules, pose[..., 0], previous_arm)], -1)
+    return namespace(pose).stack([*_scaled(rules, pose), *_previous(rules, pose[..., 0], previous_arm)], -1)
 
 
 def _relative(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsilon_rad: Array | float) -> Array:
     """One block an arm. Both arms' quantities are computed at once, with the arms on the last axis."""
     xp, cell = namespace(pose), rules.cell
+    cell.require_pair("task.layout=relative")
     scale = cell.r_max_mm
     square, yaw = cell.polar(pose)
     goal_square, goal_yaw = cell.polar(goal)
     reach = cell.within(square, yaw) + 0.0 * yaw
     goal_reach = cell.within(goal_square, goal_yaw) + 0.0 * yaw
-    mirror = xp.stack([base.mirror + 0 * pose[..., 0] for base in cell.bases], -1)
+    mirror = xp.stack([arm.mirror + 0 * pose[..., 0] for arm in cell.arms], -1)
     turn = (pose[..., 2] - goal[..., 2])[..., None]
     finish = rules.orientation_error(turn + goal_yaw - yaw, 0 * turn)
     other_goal_psi = xp.flip(cell.gripper_yaw(goal_yaw), (-1,))

@@ -13,26 +13,32 @@ from marl_handover.cell.cell import Cell
 def sample_positions(cell: Cell, count: int, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> Tensor:
     """``count`` positions (count, 2) in mm, uniform on the union of the arms' annulus sectors.
 
-    Draws from a sector chosen at random; a point that an arm of lower index reaches too counts for that arm only and is
-    drawn again, so that the shared space is not twice as dense.
+    Draws from a sector chosen at random, the larger the more often; a point that an arm of lower index reaches too counts for that arm
+    only and is drawn again, so that the shared space is not twice as dense.
     """
     device = generator.device
     kept: list[Tensor] = []
     missing = count
-    low, high = cell.r_min_mm**2, cell.r_max_mm**2
-    base = torch.tensor([(b.x_mm, b.y_mm, b.facing_rad) for b in cell.bases], dtype=dtype, device=device)
+    rows, sizes = [], []
+    for each in cell.arms:
+        low, span, turn = each.r_min_mm**2, each.r_max_mm**2 - each.r_min_mm**2, each.yaw_rad[1] - each.yaw_rad[0]
+        rows.append((each.base.x_mm, each.base.y_mm, each.base.facing_rad, low, span, each.yaw_rad[0], turn))
+        sizes.append(span * turn)
+    of_arm = torch.tensor(rows, dtype=dtype, device=device)
+    shares = torch.tensor([sum(sizes[: index + 1]) / sum(sizes) for index in range(len(sizes) - 1)], dtype=dtype, device=device)
     while missing > 0:
         draw = math.ceil(1.5 * missing) + 8
         uniform = torch.rand(3, draw, generator=generator, dtype=dtype, device=device)
-        arm = (uniform[0] * cell.num_arms).long().clamp_max(cell.num_arms - 1)
-        radius = (low + uniform[1] * (high - low)).sqrt()
-        angle = base[arm, 2] + cell.yaw_rad[0] + uniform[2] * (cell.yaw_rad[1] - cell.yaw_rad[0])
-        points = base[arm, :2] + radius[:, None] * torch.stack([angle.cos(), angle.sin()], -1)
+        arm = torch.bucketize(uniform[0], shares, right=True)
+        x_mm, y_mm, facing, low_mm2, span_mm2, yaw, yaws = of_arm[arm].unbind(-1)
+        radius = (low_mm2 + uniform[1] * span_mm2).sqrt()
+        angle = facing + yaw + uniform[2] * yaws
+        points = torch.stack([x_mm, y_mm], -1) + radius[:, None] * torch.stack([angle.cos(), angle.sin()], -1)
         owner = cell.reaches(points).to(torch.uint8).argmax(-1)
         points = points[owner == arm][:missing]
         kept.append(points)
         missing -= len(points)
-    return torch.cat([base[:0, :2], *kept])
+    return torch.cat([of_arm[:0, :2], *kept])
 
 
 def sample_poses(cell: Cell, count: int, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> Tensor:

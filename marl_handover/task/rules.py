@@ -1,7 +1,8 @@
 """The rule book: what a command does to the object, what it earns, when an episode ends. Batched and pure.
 
 Every environment of the package is a thin skin over :class:`Rules`. All arrays may be numpy or torch; shapes are (...) for a
-batch of problems, (..., 3) for poses (x_mm, y_mm, theta_rad). Arms are indices; ``previous_arm`` is -1 before the first transfer.
+batch of problems, (..., 3) for poses (x_mm, y_mm, theta_rad). Arms are indices, any number of them; ``previous_arm`` is -1 before the first
+transfer.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from marl_handover.arrays import Array, length, namespace, one_where, select, wrap
-from marl_handover.cell.cell import REACH_TOLERANCE_MM, Cell
+from marl_handover.cell.arm import REACH_TOLERANCE_MM
+from marl_handover.cell.cell import Cell
 from marl_handover.config import TaskConfig
 
 MotionCost = Callable[[Cell, Array, Array, Array], Array]
@@ -113,8 +115,10 @@ class Rules:
         self.epsilon_rad = math.radians(config.epsilon_deg)
         self.noisy = config.noise.position_mm > 0 or config.noise.yaw_deg > 0
         self.measured = self.noisy or physical
+        if cell.num_arms != 2:
+            self.action_size = 2 * cell.num_arms + 3
 
-    action_size = 4  # numbers in an action
+    action_size = 4  # numbers in an action of a pair; N arms: final, a score an arm, a score a receiver, alpha, beta
 
     @property
     def external_finish(self) -> bool:
@@ -144,14 +148,22 @@ class Rules:
         return self.finishing(pose, goal, epsilon_rad).able
 
     def decode(self, action: Array) -> Command:
-        """Command of an action (..., 4): final, arm, alpha, beta, each in [-1, 1]; a positive first or second number means final / R."""
-        xp = namespace(action)
-        arm = xp.where(action[..., 1] > 0, 1, 0)
+        """Command of an action whose numbers are in [-1, 1].
+
+        Of a pair (..., 4): final, arm, alpha, beta; a positive first or second number means final / R. Of N arms (..., 2 N + 3): final, a
+        score an arm, a score a receiver, alpha, beta; the greatest scores say who moves the object, and in the space shared with whom the
+        place lies. An arm and a receiver that share nothing have no place there: NaN, which nobody reaches.
+        """
+        xp, count = namespace(action), self.cell.num_arms
         final = action[..., 0] > 0
         if self.external_finish:
             final = xp.zeros_like(final)
-        alpha, beta = xp.clip(action[..., 2], -1.0, 1.0), xp.clip(action[..., 3], -1.0, 1.0)
-        return Command(final, arm, self.cell.chart.to_table(alpha, beta))
+        alpha, beta = xp.clip(action[..., -2], -1.0, 1.0), xp.clip(action[..., -1], -1.0, 1.0)
+        if count == 2:
+            arm = xp.where(action[..., 1] > 0, 1, 0)
+            return Command(final, arm, self.cell.graph.edges[(0, 1)].to_table(alpha, beta))
+        arm, receiver = xp.argmax(action[..., 1 : 1 + count], -1), xp.argmax(action[..., 1 + count : 1 + 2 * count], -1)
+        return Command(final, arm, self.cell.place_mm(arm, receiver, alpha, beta))
 
     def transfer(self, pose: Array, goal: Array, command: Command) -> tuple[Array, Array]:
         """Where a command takes the object on exact hardware, and whether the arm can do it: ((..., 3), bool (...)).
@@ -161,9 +173,7 @@ class Rules:
         square, yaw = self.cell.polar(pose)
         target = one_where(command.final, goal[..., :2], command.place_mm)
         target_square, target_yaw = self.cell.polar(target)
-        feasible = self.cell.within(select(square, command.arm), select(yaw, command.arm)) & self.cell.within(
-            select(target_square, command.arm), select(target_yaw, command.arm)
-        )
+        feasible = select(self.cell.within(square, yaw) & self.cell.within(target_square, target_yaw), command.arm)
         moved = carried(pose, target, select(target_yaw - yaw, command.arm))
         return one_where(feasible, moved, pose), feasible
 

@@ -106,7 +106,7 @@ def test_arms_are_mirror_images(cell):
     np.testing.assert_array_equal(cell.reaches(points), cell.reaches(mirrored)[:, ::-1])
     np.testing.assert_allclose(cell.polar(points)[1], -cell.polar(mirrored)[1][:, ::-1], atol=1e-12)
     assert cell.bases[LEFT].y_mm == -cell.bases[RIGHT].y_mm > 0
-    assert cell.bases[LEFT].mirror == -cell.bases[RIGHT].mirror
+    assert cell.arms[LEFT].mirror == -cell.arms[RIGHT].mirror
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -11,11 +11,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marl_handover.cell import GROUP, LEFT, NO_ARM, RIGHT, Symmetry
+from marl_handover.cell import LEFT, NO_ARM, RIGHT
+from tests.symmetries import GROUP, mirror
 
 poses = st.tuples(st.floats(-300, 300), st.floats(-300, 300), st.floats(-math.pi, math.pi)).map(np.array)
 elements = st.sampled_from(GROUP)
-IDENTITY = Symmetry()
+IDENTITY = mirror()
 
 
 def same_pose(first, second) -> bool:
@@ -73,10 +74,10 @@ def test_arms_and_actions_swap_together(element, cell, rules_of):
 def test_each_mirror_by_hand():
     """M_y: (x, y, theta) -> (x, -y, -theta), L <-> R. M_x: (x, y, theta) -> (-x, y, pi - theta)."""
     pose, action = np.array([10.0, 20.0, 0.25]), np.array([1.0, -1.0, 0.5, 0.75])
-    np.testing.assert_allclose(Symmetry(mirror_y=True).pose(pose), [10, -20, -0.25])
-    np.testing.assert_allclose(Symmetry(mirror_x=True).pose(pose), [-10, 20, math.pi - 0.25])
-    np.testing.assert_allclose(Symmetry(mirror_y=True).action(action), [1, 1, 0.5, -0.75])
-    np.testing.assert_allclose(Symmetry(mirror_x=True).action(action), [1, -1, -0.5, 0.75])
+    np.testing.assert_allclose(mirror(y=True).pose(pose), [10, -20, -0.25])
+    np.testing.assert_allclose(mirror(x=True).pose(pose), [-10, 20, math.pi - 0.25])
+    np.testing.assert_allclose(mirror(y=True).action(action), [1, 1, 0.5, -0.75])
+    np.testing.assert_allclose(mirror(x=True).action(action), [1, -1, -0.5, 0.75])
 
 
 @pytest.mark.parametrize("element", GROUP)
@@ -84,4 +85,4 @@ def test_reach_is_symmetric(element, cell):
     points = np.random.default_rng(2).uniform(-1, 1, (20_000, 3)) * (400, 600, math.pi)
     reach, image = cell.reaches(points), cell.reaches(element.pose(points))
     assert reach[:, 0].any()
-    np.testing.assert_array_equal(image, reach[:, ::-1] if element.mirror_y else reach)
+    np.testing.assert_array_equal(image, reach[:, ::-1] if element.swaps else reach)

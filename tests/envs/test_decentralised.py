@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchrl.envs.utils import check_env_specs, step_mdp
 
-from marl_handover.cell.symmetry import GROUP
 from marl_handover.config import DecentralisedConfig, NoiseConfig, TaskConfig
 from marl_handover.envs.decentralised import VIEW_SIZE, DecentralisedEnv, TurnRules, own_view
 from marl_handover.errors import InvalidSetting
 from marl_handover.task.observations import ARM_FIELDS, observe
 from marl_handover.task.rules import Outcome, Rules
+from tests.symmetries import GROUP, flips_x
 
 FIELDS = len(ARM_FIELDS)
 
@@ -87,13 +87,13 @@ def test_both_arms_live_in_one_problem(paper, draw, seed, element):
     """Under a mirror of the table the same numbers do the mirrored thing, and are asked for by the same view."""
     rules = turn_rules(paper)
     start, goal, turn, action = decisions(draw, paper, 60, seed)
-    mirrored = action * np.array([1.0, -1.0 if element.mirror_x else 1.0, 1.0])
+    mirrored = action * np.array([1.0, -1.0 if flips_x(element) else 1.0, 1.0])
     there = rules.take_turn(element.pose(start), element.pose(goal), element.arm(turn), mirrored)
     here = rules.take_turn(start, goal, turn, action)
     np.testing.assert_array_equal(there.feasible, here.feasible)
     np.testing.assert_array_equal(there.reward, here.reward)
     np.testing.assert_allclose(there.placed[:, :2], element.pose(here.placed)[:, :2], atol=1e-9)
-    if not element.mirror_x:
+    if not flips_x(element):
         both = (
             observe(rules, "relative", start, goal, 0 * turn - 1),
             observe(rules, "relative", element.pose(start), element.pose(goal), 0 * turn - 1),

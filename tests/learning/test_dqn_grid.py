@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marl_handover.arrays import wrap
-from marl_handover.cell.symmetry import GROUP, Symmetry
 from marl_handover.errors import InvalidSetting
 from marl_handover.learning.dqn_grid import finishing_potential, goal_reach, grid_actions, grid_points, grid_transfers, seen_by_finishers
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.task.observations import ARM_FIELDS, observe
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Outcome
+from tests.symmetries import GROUP, mirror
 
 layouts = pytest.mark.parametrize("layout", ["raw", "relative"])
 
@@ -96,10 +96,10 @@ def test_a_raw_goal_is_shown_as_the_finishing_arm_has_it(paper, rules_of, draw, 
 
 
 def test_relative_finishers_see_one_problem_in_mirrored_frames(paper, rules_of, draw):
-    rules, mirror = rules_of(paper, "A"), Symmetry(mirror_y=True)
+    rules, swap = rules_of(paper, "A"), mirror(y=True)
     start, goal, previous, _ = draw(paper, 300, 3)
     seen = seen_by_finishers(rules, "relative", observe(rules, "relative", start, goal, previous))
-    image = seen_by_finishers(rules, "relative", observe(rules, "relative", mirror.pose(start), mirror.pose(goal), mirror.arm(previous)))
+    image = seen_by_finishers(rules, "relative", observe(rules, "relative", swap.pose(start), swap.pose(goal), swap.arm(previous)))
     np.testing.assert_allclose(image, seen[:, ::-1], atol=1e-9)
     assert seen.shape[-1] == 2 * len(ARM_FIELDS)
 
@@ -115,7 +115,7 @@ def test_potential_is_the_share_of_half_a_turn_that_is_left(cell, rules_of, draw
     np.testing.assert_array_equal(able, potential >= -0.2 / math.pi)
     for symmetry in GROUP:
         image = finishing_potential(rules, symmetry.pose(start), symmetry.pose(goal))
-        np.testing.assert_allclose(image[:, ::-1] if symmetry.mirror_y else image, potential, atol=1e-9)
+        np.testing.assert_allclose(image[:, ::-1] if symmetry.swaps else image, potential, atol=1e-9)
 
 
 def brute_force(rules, actions, start, goal, depth):

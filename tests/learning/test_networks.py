@@ -9,11 +9,11 @@ import torch
 from torch.nn import functional as F
 from torchrl.modules import TanhNormal
 
-from marl_handover.cell.symmetry import GROUP
 from marl_handover.learning.hybrid_sac import squashed_sample
 from marl_handover.learning.networks import Branches, Harmonics, HybridActor, TwinMLP, arm_blocks
 from marl_handover.learning.variants import Variant
 from marl_handover.task.observations import ARM_FIELDS, observe
+from tests.symmetries import GROUP, flips_x
 
 
 @pytest.fixture(autouse=True)
@@ -39,9 +39,9 @@ def test_actor_is_equivariant(cell, rules_of, draw, symmetry, can_finish):
     actor = HybridActor(cell, [24, 24], modes=2, can_finish=can_finish, canonical=True, harmonics=2).double()
     problem = problems(draw, cell)
     plain, mirrored = actor(seen(rules, *problem, GROUP[0])), actor(seen(rules, *problem, symmetry))
-    if symmetry.mirror_y:
+    if symmetry.swaps:
         plain = Branches(*(part.flip(1) for part in plain))
-    sign = torch.tensor([-1.0 if symmetry.mirror_x else 1.0, -1.0 if symmetry.mirror_y else 1.0]).double()
+    sign = torch.tensor([-1.0 if flips_x(symmetry) else 1.0, -1.0 if symmetry.swaps else 1.0]).double()
     torch.testing.assert_close(mirrored.logits, plain.logits)
     torch.testing.assert_close(mirrored.mean, plain.mean * sign)
     torch.testing.assert_close(mirrored.log_std, plain.log_std)
@@ -53,7 +53,7 @@ def test_actor_that_does_not_fold_is_not_equivariant_along_the_base_line(paper, 
     actor = HybridActor(paper, [24, 24], modes=1, can_finish=True, canonical=False, harmonics=2).double()
     problem, rules = problems(draw, paper), rules_of(paper)
     logits = {symmetry: actor(seen(rules, *problem, symmetry)).logits for symmetry in GROUP}
-    along, across = (next(s for s in GROUP if (s.mirror_x, s.mirror_y) == kind) for kind in ((True, False), (False, True)))
+    along, across = (next(s for s in GROUP if (flips_x(s), s.swaps) == kind) for kind in ((True, False), (False, True)))
     assert (logits[along] - logits[GROUP[0]]).abs().max() > 1e-2
     torch.testing.assert_close(logits[across].flip(1), logits[GROUP[0]])
 
@@ -64,7 +64,7 @@ def test_critic_is_invariant(cell, rules_of, draw, small, symmetry):
     critic = Variant().algorithm(rules, small("sac", "algorithm.canonical=true"), torch.Generator()).loss.critic.double()
     problem = problems(draw, cell)
     plain, mirrored = (arm_blocks(seen(rules, *problem, element)) for element in (GROUP[0], symmetry))
-    if symmetry.mirror_y:
+    if symmetry.swaps:
         mirrored = mirrored.flip(1)
     torch.testing.assert_close(critic.value_final(mirrored), critic.value_final(plain))
     torch.testing.assert_close(critic.value_place(mirrored), critic.value_place(plain))

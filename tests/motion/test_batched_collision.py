@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from marl_handover.cell import build_cell, cell_config
-from marl_handover.cell.symmetry import Symmetry
 from marl_handover.config import CentralisedConfig, MotionConfig
 from marl_handover.geometry.capsules import segment_distance
 from marl_handover.motion.batched_collision import CROWDING, ROUNDING_MM, MotionCheck
@@ -15,6 +14,7 @@ from marl_handover.motion.batched_paths import JOINTS, MotionNumbers, ends_of
 from marl_handover.motion.grasp_ik import grasp_joints
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.splines import basis, sample_places
+from tests.symmetries import flips_x, mirror
 
 SAMPLES = 33
 BAND_MM = 0.02
@@ -199,14 +199,14 @@ def test_most_straight_guesses_pass_and_no_flat_zero_does():
 
 
 @pytest.mark.parametrize("kind", ["flat", "offset"])
-@pytest.mark.parametrize("symmetry", [Symmetry(mirror_x=True), Symmetry(mirror_y=True), Symmetry(True, True)])
+@pytest.mark.parametrize("symmetry", [mirror(x=True), mirror(y=True), mirror(x=True, y=True)])
 def test_mirror_laws(kit, kind, symmetry):
     """One mirror turns base yaws round, in the same arm's frame or in the other's; both are half a turn, which changes no joint."""
     arm, from_mm, to_mm = ways(kit.cell, 400, seed=11)
     numbers = kit.numbers[kind]
     given = (0.1 if kind == "offset" else 1.0) * uniform(400, numbers.count)
     image = given.clone().unflatten(-1, (-1, JOINTS))
-    turned = -1.0 if symmetry.mirror_x != symmetry.mirror_y else 1.0
+    turned = -1.0 if flips_x(symmetry) != symmetry.swaps else 1.0
     image[..., 0] *= turned
     mirrored = [symmetry.pose(torch.cat([place, place[:, :1] * 0], -1))[:, :2] for place in (from_mm, to_mm)]
     other = symmetry.arm(arm)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
-from marl_handover.cell import GROUP, Cell, build_cell, cell_config
+from marl_handover.cell import Cell, build_cell, cell_config
 from marl_handover.config import MotionConfig, RewardConfig, TaskConfig
 from marl_handover.envs import SupervisorEnv, SupervisorGoalEnv
 from marl_handover.errors import CorruptFile, MissingFile
@@ -19,6 +19,7 @@ from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import adapted, load
 from marl_handover.resources import package_path
 from marl_handover.task.rules import Rules, straight_line_mm
+from tests.symmetries import GROUP
 
 MOTION = MotionConfig()
 

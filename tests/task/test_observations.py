@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from marl_handover.cell import Symmetry
 from marl_handover.config import LAYOUTS
 from marl_handover.errors import UnknownChoice
 from marl_handover.task.observations import ARM_FIELDS, OBJECT_FIELDS, RAW_FIELDS, observation_size, observe
+from tests.symmetries import mirror
 
 COUNT = 5000
 ODD = {"x", "goal_x", "sin_finish_error", "finish_error_in_epsilons", "sin_hand_over", "other_finish_error_in_epsilons"}
@@ -73,19 +73,19 @@ def test_object_is_raw_without_the_goal(cell, rules_of, draw):
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_mirroring_the_arms_swaps_their_blocks(order, cell, rules_of, draw):
-    rules, mirror = rules_of(cell, symmetry_order=order), Symmetry(mirror_y=True)
+    rules, mirrored = rules_of(cell, symmetry_order=order), mirror(y=True)
     pose, goal, previous, _ = draw(cell, COUNT, 4)
     seen = blocks(observe(rules, "relative", pose, goal, previous))
-    image = blocks(observe(rules, "relative", mirror.pose(pose), mirror.pose(goal), mirror.arm(previous)))
+    image = blocks(observe(rules, "relative", mirrored.pose(pose), mirrored.pose(goal), mirrored.arm(previous)))
     np.testing.assert_allclose(image, seen[:, ::-1], atol=1e-9)
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_mirroring_along_the_base_line_flips_exactly_the_odd_fields(order, cell, rules_of, draw):
-    rules, mirror = rules_of(cell, symmetry_order=order), Symmetry(mirror_x=True)
+    rules, mirrored = rules_of(cell, symmetry_order=order), mirror(x=True)
     pose, goal, previous, _ = draw(cell, COUNT, 5)
     seen = blocks(observe(rules, "relative", pose, goal, previous))
-    image = blocks(observe(rules, "relative", mirror.pose(pose), mirror.pose(goal), previous))
+    image = blocks(observe(rules, "relative", mirrored.pose(pose), mirrored.pose(goal), previous))
     flips = np.abs(image + seen).max((0, 1)) < 1e-9
     stays = np.abs(image - seen).max((0, 1)) < 1e-9
     assert {name for name, flip in zip(ARM_FIELDS, flips, strict=True) if flip} == ODD
@@ -132,7 +132,7 @@ def test_hand_over_field_names_the_place_where_the_other_arm_can_finish(cell, ru
     action[:, 0] = -1
     result = rules.step(pose, goal, previous, action)
     arm, rows = result.command.arm, np.arange(COUNT)
-    sign = np.array([base.mirror for base in cell.bases])[arm]
+    sign = np.array([arm.mirror for arm in cell.arms])[arm]
     seen = observe(rules, "relative", pose, goal, previous)
     needed = sign * np.arctan2(field(seen, "sin_hand_over"), field(seen, "cos_hand_over"))[rows, arm]
     psi = cell.gripper_yaw(cell.polar(result.placed)[1])

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from marl_handover.cell import GROUP, LEFT, RIGHT, load_cell
-from marl_handover.cell.cell import mirrored_pair
+from marl_handover.cell import LEFT, RIGHT, load_cell
+from marl_handover.cell.arm import mirrored_pair
 from marl_handover.errors import InvalidSetting
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome
+from tests.symmetries import GROUP, flips_x
 
 MANY, SOME = 100_000, 1000
 
@@ -183,7 +184,7 @@ def test_plans_are_symmetric(element, cell, rules_of):
     np.testing.assert_array_equal(image.first_arm, element.arm(plan.first_arm))
     longer = plan.transfers > 1
     place, place_image = planner.hand_over_mm(plan, 0)[longer], planner.hand_over_mm(image, 0)[longer]
-    np.testing.assert_allclose(place_image, place * (-1 if element.mirror_x else 1, 1), atol=1e-6)
+    np.testing.assert_allclose(place_image, place * (-1 if flips_x(element) else 1, 1), atol=1e-6)
 
 
 def test_reversed_problems_are_as_long(cell, rules_of):
@@ -224,16 +225,17 @@ def test_intervals_by_hand(paper, rules_of):
     planner = ExactPlanner(rules_of(paper))
     low = 2 * math.atan2(180, math.sqrt(230**2 - 180**2))
     high = 2 * math.pi - low
-    assert planner.interval(1, LEFT) == (0, 0)
-    assert planner.interval(2, LEFT) == pytest.approx((low, high))
-    assert planner.interval(2, RIGHT) == pytest.approx((-high, -low))
-    assert planner.interval(3, LEFT) == planner.interval(3, RIGHT) == pytest.approx((low - high, high - low))
-    assert planner.interval(4, LEFT) == pytest.approx((2 * low - high, 2 * high - low))
+    assert planner.interval((LEFT,)) == (0, 0)
+    assert planner.interval((LEFT, RIGHT)) == pytest.approx((low, high))
+    assert planner.interval((RIGHT, LEFT)) == pytest.approx((-high, -low))
+    assert planner.interval((LEFT, RIGHT, LEFT)) == planner.interval((RIGHT, LEFT, RIGHT)) == pytest.approx((low - high, high - low))
+    assert planner.interval((LEFT, RIGHT, LEFT, RIGHT)) == pytest.approx((2 * low - high, 2 * high - low))
 
 
 def test_cells_for_which_it_would_not_be_exact_are_refused(rules_of):
     """A shared space that reaches behind the bases has smaller hand-over angles than at its tips."""
     cell = load_cell("al5a")
-    wide = replace(cell, bases=mirrored_pair(250.0), r_min_mm=100.0, config=replace(cell.config, base_distance_mm=250.0))
+    arms = [replace(arm, base=base, r_min_mm=100.0) for arm, base in zip(cell.arms, mirrored_pair(250.0), strict=True)]
+    wide = replace(cell, arms=tuple(arms), config=replace(cell.config, base_distance_mm=250.0))
     with pytest.raises(InvalidSetting, match=r"base_distance_mm = 250\.0: must be at least 296\.6"):
         ExactPlanner(rules_of(wide))

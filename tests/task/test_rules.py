@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from marl_handover.cell import GROUP
 from marl_handover.config import TaskConfig
 from marl_handover.task.rules import Outcome, Rules, Transition
+from tests.symmetries import GROUP
 
 COUNT = 20_000
 architectures = pytest.mark.parametrize("architecture", ["A", "B"])

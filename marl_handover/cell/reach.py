@@ -74,37 +74,37 @@ def feasible(arm: ArmModel, points_base_mm: ArrayLike, pick_height_mm: float) ->
     return np.asarray(good.any(axis=-1))
 
 
-def manipulation_grid(arm: ArmModel, cell: CellConfig, bases: Sequence[SE2]) -> ManipulationGrid:
-    """The grid of world points that covers the reach of one ``arm`` standing on each of ``bases``.
+def manipulation_grid(arms: Sequence[ArmModel], cell: CellConfig, bases: Sequence[SE2]) -> ManipulationGrid:
+    """The grid of world points that covers the reach of ``arms``, each standing on its base.
 
     Raises :class:`InvalidSetting` if ``grid_mm`` is not above 0 or ``pick_height_mm`` is not a finite number of at least 0.
     """
     check_bounds(cell)
-    _require_moderate(arm, cell, bases)
+    _require_moderate(arms, cell, bases)
     axes: list[Floats] = []
     for axis in range(2):
-        low = math.floor((min(base.position_mm[axis] for base in bases) - arm.reach_mm) / cell.grid_mm)
-        high = math.ceil((max(base.position_mm[axis] for base in bases) + arm.reach_mm) / cell.grid_mm)
+        low = math.floor(min(base.position_mm[axis] - arm.reach_mm for arm, base in zip(arms, bases, strict=True)) / cell.grid_mm)
+        high = math.ceil(max(base.position_mm[axis] + arm.reach_mm for arm, base in zip(arms, bases, strict=True)) / cell.grid_mm)
         axes.append(cell.grid_mm * np.arange(low, high + 1, dtype=np.float64))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    masks = np.stack([feasible(arm, base.to_local(points), cell.pick_height_mm) for base in bases])
+    masks = np.stack([feasible(arm, base.to_local(points), cell.pick_height_mm) for arm, base in zip(arms, bases, strict=True)])
     for array in (*axes, masks):
         array.setflags(write=False)
     return ManipulationGrid(axes[0], axes[1], masks, tuple(bases), float(cell.pick_height_mm))
 
 
-def _require_moderate(arm: ArmModel, cell: CellConfig, bases: Sequence[SE2]) -> None:
+def _require_moderate(arms: Sequence[ArmModel], cell: CellConfig, bases: Sequence[SE2]) -> None:
     """Raise for a grid of more than :data:`MOST_POINTS` points."""
-    places = np.array([(base.x_mm, base.y_mm) for base in bases])
-    sides_mm = np.ptp(places, axis=0) + 2 * arm.reach_mm
+    farthest_mm = max(arm.reach_mm for arm in arms)
+    sides_mm = np.ptp(np.array([base.position_mm for base in bases]), axis=0) + 2 * farthest_mm
     least_mm = math.sqrt(sides_mm[0] * sides_mm[1] / MOST_POINTS)
     if cell.grid_mm < least_mm:
-        limit = f"at least {least_mm:.3g} for these arms, which reach {arm.reach_mm:.4g} mm: the grid has at most {MOST_POINTS} points"
+        limit = f"at least {least_mm:.3g} for these arms, which reach {farthest_mm:.4g} mm: the grid has at most {MOST_POINTS} points"
         raise InvalidSetting("grid_mm", cell.grid_mm, limit)
 
 
-def fit_annulus(grid: ManipulationGrid, rounding_mm: float = 0.0, weight: float = 1000.0) -> AnnulusFit:
-    """Fit one sector of an annulus to the points of all arms together, seen from their bases.
+def fit_annulus(grid: ManipulationGrid, rounding_mm: float = 0.0, weight: float = 1000.0, arms: Sequence[int] | None = None) -> AnnulusFit:
+    """Fit one sector of an annulus to the points of ``arms`` (None: all) together, seen from their bases.
 
     The radii, then the yaws, are the contiguous run that maximises (reachable points - ``weight`` x unreachable points), in turn until
     nothing changes. Then the radii are rounded inwards to a multiple of ``rounding_mm`` (0: not at all).
@@ -112,8 +112,9 @@ def fit_annulus(grid: ManipulationGrid, rounding_mm: float = 0.0, weight: float 
     Raises :class:`InvalidSetting` on ``pick_height_mm`` if no point can be reached, and on ``fit_rounding_mm`` if rounding leaves nothing.
     """
     require_at_least("fit_rounding_mm", rounding_mm, 0)
-    points = np.concatenate([grid.points_base_mm(index).reshape(-1, 2) for index in range(len(grid.bases))])
-    good = grid.masks.reshape(-1)
+    chosen = list(range(len(grid.bases))) if arms is None else list(arms)
+    points = np.concatenate([grid.points_base_mm(index).reshape(-1, 2) for index in chosen])
+    good = grid.masks[chosen].reshape(-1)
     if not good.any():
         limit = "a height at which the arm, its gripper level, reaches part of the table; here it reaches no grid point"
         raise InvalidSetting("pick_height_mm", grid.pick_height_mm, limit)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from marl_handover.cell.spaces import ManipulationGrid, feasible, fit_annulus, manipulation_grid
+from marl_handover.cell.reach import ManipulationGrid, feasible, fit_annulus, manipulation_grid
 from marl_handover.config import CellConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
@@ -35,7 +35,7 @@ def pair(base_distance_mm: float) -> list[SE2]:
 
 def build(limits: dict[str, list[float]], base_distance_mm: float, pick_height_mm: float = 45.0) -> ManipulationGrid:
     cell = CellConfig(base_distance_mm=base_distance_mm, pick_height_mm=pick_height_mm)
-    return manipulation_grid(ClosedFormArm(DESCRIPTION, limits), cell, pair(base_distance_mm))
+    return manipulation_grid([ClosedFormArm(DESCRIPTION, limits)] * 2, cell, pair(base_distance_mm))
 
 
 PAPER_GRID = build(PAPER, 360.0)
@@ -106,8 +106,8 @@ def test_mask_equals_feasibility_point_by_point() -> None:
 def test_one_arm_and_three_arms_work() -> None:
     cell = CellConfig()
     bases = [base_at(0.0, 0.0, 0.0), base_at(400.0, 0.0, math.pi), base_at(0.0, 400.0, 0.3)]
-    assert manipulation_grid(PAPER_ARM, cell, bases[:1]).masks.shape[0] == 1
-    three = manipulation_grid(PAPER_ARM, cell, bases)
+    assert manipulation_grid([PAPER_ARM], cell, bases[:1]).masks.shape[0] == 1
+    three = manipulation_grid([PAPER_ARM] * 3, cell, bases)
     assert three.masks.any(axis=(1, 2)).all()
     fit = fit_annulus(three, 1.0)
     assert (fit.r_min_mm, fit.r_max_mm) == pytest.approx((150, 230), abs=1)
@@ -169,6 +169,6 @@ def test_bad_settings_are_named() -> None:
     with pytest.raises(InvalidSetting, match="pick_height_mm"):
         build(PAPER, 360.0, pick_height_mm=math.nan)
     with pytest.raises(InvalidSetting, match="grid_mm"):
-        manipulation_grid(PAPER_ARM, CellConfig(grid_mm=0.0), pair(360.0))
+        manipulation_grid([PAPER_ARM] * 2, CellConfig(grid_mm=0.0), pair(360.0))
     with pytest.raises(InvalidSetting, match="fit_rounding_mm"):
         fit_annulus(known(101.0, 130.0, -1, 1), rounding_mm=100.0)

@@ -1,0 +1,49 @@
+"""One arm of a cell: where it stands and what it reaches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_handover.geometry.se2 import SE2
+
+REACH_TOLERANCE_MM = 1e-3
+"""Membership has this tolerance everywhere: at beta = +-1 float32 rounding would put one chart point in ten outside."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An arm that stands on the table.
+
+    Attributes:
+        name: unique in its cell.
+        base: its base frame; +x is the direction of zero yaw.
+        r_min_mm, r_max_mm: radii of the annulus around its base in which it can pick and place.
+        yaw_rad: (lower, upper) base yaw about its facing.
+        robot: which robot it is: arms of the same robot move alike.
+        mirror: -1 for an arm that is built or seen as the mirror image of the others, else 1.
+    """
+
+    name: str
+    base: SE2
+    r_min_mm: float
+    r_max_mm: float
+    yaw_rad: tuple[float, float]
+    robot: str = ""
+    mirror: int = 1
+
+    def reaches(self, position_mm: ArrayLike) -> NDArray[np.bool_]:
+        """Whether it can place at world positions (..., 2), to :data:`REACH_TOLERANCE_MM`: (...)."""
+        local = self.base.to_local(position_mm)
+        radius, yaw = np.hypot(local[..., 0], local[..., 1]), np.arctan2(local[..., 1], local[..., 0])
+        slack = REACH_TOLERANCE_MM / self.r_min_mm
+        good = (radius >= self.r_min_mm - REACH_TOLERANCE_MM) & (radius <= self.r_max_mm + REACH_TOLERANCE_MM)
+        return np.asarray(good & (yaw >= self.yaw_rad[0] - slack) & (yaw <= self.yaw_rad[1] + slack))
+
+
+def mirrored_pair(base_distance_mm: float) -> tuple[SE2, SE2]:
+    """Left base at (0, +d/2) facing -y, right base at (0, -d/2) facing +y: each faces the other."""
+    half = base_distance_mm / 2
+    return SE2(0.0, half, (0.0, -1.0)), SE2(0.0, -half, (0.0, 1.0))

@@ -1,0 +1,115 @@
+"""What two arms share: where one can hand an object to the other, and the chart of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from marl_handover.arrays import Array, namespace
+from marl_handover.cell.arm import Arm
+from marl_handover.cell.chart import Chart
+from marl_handover.errors import NoSharedSpace
+from marl_handover.geometry.se2 import SE2
+
+SAMPLES = 65
+"""Radii of each arm at which a shared space is looked for: a piece narrower than about 2 mm is no place to hand anything over."""
+
+_ALIKE_MM = 1e-6
+
+
+@dataclass(frozen=True)
+class SharedSpace:
+    """The places that both of two arms reach.
+
+    Attributes:
+        first: an arm of the cell.
+        second: another one.
+        inset: part of the chart that is in use.
+    """
+
+    first: Arm
+    second: Arm
+    inset: float = 1.0
+
+    @property
+    def base_distance_mm(self) -> float:
+        """How far apart the two bases stand."""
+        return math.dist(self.first.base.position_mm, self.second.base.position_mm)
+
+    @cached_property
+    def frame(self) -> SE2:
+        """The frame of the chart: its origin lies midway between the bases, +y points to the first one."""
+        one, other = self.first.base.position_mm, self.second.base.position_mm
+        x_mm, y_mm = (one + other) / 2
+        up = (one - other) / self.base_distance_mm
+        return SE2(float(x_mm), float(y_mm), (float(up[1]), float(-up[0])))
+
+    @cached_property
+    def is_empty(self) -> bool:
+        """Whether there is no such place."""
+        distance = self.base_distance_mm
+        r_1 = np.linspace(self.first.r_min_mm, self.first.r_max_mm, SAMPLES)[:, None, None]
+        r_2 = np.linspace(self.second.r_min_mm, self.second.r_max_mm, SAMPLES)[None, :, None]
+        # Circles around both bases meet at two points of the frame, on either side of the base line.
+        y = (r_2**2 - r_1**2) / (2 * distance)
+        square = r_1**2 - (distance / 2 - y) ** 2
+        x = np.sqrt(np.maximum(square, 0.0)) * np.array([-1.0, 1.0])
+        points = self.frame.to_world(np.stack(np.broadcast_arrays(x, y), axis=-1))
+        return not bool(((square >= 0) & self.first.reaches(points) & self.second.reaches(points)).any())
+
+    @cached_property
+    def chart(self) -> Chart:
+        """The paper's chart of the space, in :attr:`frame`.
+
+        Raises:
+            NoSharedSpace: the space is not the whole lens that two equal annuli have in common.
+        """
+        one, other, distance = self.first, self.second, self.base_distance_mm
+        if max(abs(one.r_min_mm - other.r_min_mm), abs(one.r_max_mm - other.r_max_mm)) > _ALIKE_MM:
+            reason = f"arms {one.name!r} and {other.name!r} reach {one.r_min_mm:g} to {one.r_max_mm:g} and {other.r_min_mm:g} to "
+            raise NoSharedSpace(distance, one.r_min_mm, one.r_max_mm, f"{reason}{other.r_max_mm:g} mm; its chart needs equal radii")
+        chart = Chart(one.r_min_mm, one.r_max_mm, distance, self.inset)
+        tip = math.atan2(chart.x_max_mm, distance / 2)
+        for arm, partner in ((one, other), (other, one)):
+            ahead = arm.base.to_local(partner.base.position_mm)
+            towards = math.atan2(ahead[1], ahead[0])
+            # The bases of a mirrored pair face each other up to rounding.
+            low, high = towards - tip + 1e-12, towards + tip - 1e-12
+            if arm.yaw_rad[0] > low or arm.yaw_rad[1] < high:
+                straight, (least, most) = abs(towards) < 1e-9, np.degrees(arm.yaw_rad)
+                needed = f"+-{math.degrees(tip):.1f}" if straight else f"{math.degrees(low):.1f} to {math.degrees(high):.1f}"
+                reason = f"its tips need a base yaw of {needed} deg, the arm has {least:.1f} to {most:.1f} deg"
+                raise NoSharedSpace(distance, arm.r_min_mm, arm.r_max_mm, reason)
+        return chart
+
+    def to_table(self, alpha: Array, beta: Array) -> Array:
+        """World position (..., 2) in mm of chart coordinates, each of shape (...)."""
+        return self.in_world(self.chart.to_table(alpha, beta))
+
+    def from_table(self, position_mm: Array) -> tuple[Array, Array]:
+        """Chart coordinates (alpha, beta), each (...), of a world position (..., 2) in mm."""
+        return self.chart.from_table(self.in_frame(position_mm))
+
+    def in_world(self, position_mm: Array) -> Array:
+        """Points (..., 2) of :attr:`frame` in the world; numpy or torch."""
+        if self._is_world:
+            return position_mm
+        frame, (cos, sin) = self.frame, self.frame.facing
+        x, y = position_mm[..., 0], position_mm[..., 1]
+        return namespace(position_mm).stack([frame.x_mm + cos * x - sin * y, frame.y_mm + sin * x + cos * y], -1)
+
+    def in_frame(self, position_mm: Array) -> Array:
+        """World points (..., >= 2) in :attr:`frame`; numpy or torch."""
+        if self._is_world:
+            return position_mm
+        frame, (cos, sin) = self.frame, self.frame.facing
+        dx, dy = position_mm[..., 0] - frame.x_mm, position_mm[..., 1] - frame.y_mm
+        return namespace(position_mm).stack([cos * dx + sin * dy, cos * dy - sin * dx], -1)
+
+    @cached_property
+    def _is_world(self) -> bool:
+        """Whether the frame is the world's, as a mirrored pair has it."""
+        return self.frame == SE2(0.0, 0.0, (1.0, 0.0))
