@@ -78,6 +78,8 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         self._transfers = 0
         self._problems = ProblemSource(self.rules.cell)
 
+    _spec: EnvSpec | None = None  # of an environment that was made without gymnasium.make
+
     @property
     def spec(self) -> EnvSpec | None:
         """Gymnasium's description of this environment, which :func:`gymnasium.make` sets; its step limit is the task's."""
