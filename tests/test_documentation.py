@@ -16,7 +16,7 @@ import yaml
 
 from marl_handover.cli import COMMANDS, PROGRAM
 from marl_handover.errors import MissingExtra
-from marl_handover.hardware.errors import BoardReset, BoardSilent, NotConfirmed, PortNotFound, Stopped
+from marl_handover.hardware.errors import BoardReset, BoardSilent, NotConfirmed, PortNotFound, PulseMismatch, Stopped
 from marl_handover.viewer.server import PortTaken
 from tests.docs_blocks import PAGES, ROOT, Session, blocks, check_line, command, command_lines, matches, write_file
 
@@ -194,6 +194,7 @@ def messages():
         PortNotFound("", "none looks like a controller board", []),
         BoardSilent("/dev/ttyUSB0", [115200, 9600]),
         BoardReset("main", [0, 1]),
+        PulseMismatch("main", 3, 1500, (1700, 1730), 15),
         NotConfirmed(),
         Stopped("a reason"),
         PortTaken(8080, "Address already in use"),

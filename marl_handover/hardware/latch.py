@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import secrets
+import stat
 import time
 from pathlib import Path
 
@@ -42,7 +43,7 @@ class StopLatch:
 
     def __init__(self, path: Path | str, roll: Roll | None = None) -> None:
         self.path, self.roll = Path(path), roll or Roll()
-        self._receipt = self.path.with_name(self.path.name + ".obeyed")
+        self._receipt = Path(f"{self.path}.obeyed")
         self._here = ""
         self._entry: Path | None = None
 
@@ -60,10 +61,12 @@ class StopLatch:
     def latch(self, reason: str) -> None:
         """Stop this session and every other one with the same file. Works in this process even if the file cannot be written.
 
-        Raises OSError if it cannot be written, unless something else is there already: that stops as well.
+        Raises OSError if it cannot be written, unless something else is there already: that stops as well, and a device or a pipe stays.
         """
         self._here = plain(reason) or "stop"
         self._forget_receipts()
+        if self._kind() not in (0, stat.S_IFREG):
+            return
         self.path.parent.mkdir(parents=True, exist_ok=True)
         try:
             _put(self.path, json.dumps({"reason": self._here, "pid": os.getpid(), "time": time.time()}))
@@ -110,12 +113,21 @@ class StopLatch:
 
     def clear(self) -> None:
         """Allow motion again. Nothing moves by itself. Raises :class:`NotCleared` if this user cannot take the stop away."""
+        if self._kind() in (stat.S_IFCHR, stat.S_IFBLK):
+            raise NotCleared(self.path, "it is a device")
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:
             raise NotCleared(self.path, f"{error.strerror or error}{self._whose()}") from error
         self._here = ""
         self._forget_receipts()
+
+    def _kind(self) -> int:
+        """What lies in the file's place, as ``stat`` names kinds; 0: nothing that can be seen."""
+        try:
+            return stat.S_IFMT(os.lstat(self.path).st_mode)
+        except OSError:
+            return 0
 
     def _whose(self) -> str:
         """Words on whose the stop file is, if it is somebody else's."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,19 @@ class Mover:
             NotConfirmed: nobody confirmed that the arms may move.
             DeviceError: the electronics cannot be brought up within the settings' patience.
         """
+        with self._noting():
+            self._ready()
+
+    @contextlib.contextmanager
+    def _noting(self) -> Iterator[None]:
+        """Log a board that does not do what it is told: it ends the session."""
+        try:
+            yield
+        except PulseMismatch as failure:
+            self.log.add(Event.PULSE_MISMATCH, text=failure)
+            raise
+
+    def _ready(self) -> None:
         if self.driver.state is State.DISCONNECTED:
             self.driver.connect()
         if self.driver.state is State.CONNECTED:
@@ -80,15 +94,12 @@ class Mover:
             PulseMismatch: a board does not do what it is told.
             DeviceError: the electronics cannot be brought up again.
         """
-        try:
+        with self._noting():
             return self._play(arm, phases, called_off)
-        except PulseMismatch as failure:
-            self.log.add(Event.PULSE_MISMATCH, text=failure)
-            raise
 
     def _play(self, arm: int, phases: Sequence[Phase], called_off: Callable[[float], bool] | None) -> bool:
         try:
-            self.ready()
+            self._ready()
         except (BoardReset, PortLost):
             return self._start_over()
         aimed = self.play_out.led(arm, phases)

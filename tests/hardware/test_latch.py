@@ -7,6 +7,7 @@ import os
 import stat
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -165,13 +166,29 @@ def test_pipes_in_the_way_are_neither_waited_for_nor_written_to(tmp_path):
     os.mkfifo(tmp_path / "stop.obeyed")
     assert latch.obeyed_by() is None
     latch.latch("now")
-    assert StopLatch(latch.path).reason() == "now"
+    assert StopLatch(latch.path).is_set()
+    assert latch.path.is_fifo()
+    latch.clear()
     victim = tmp_path / "victim"
     victim.write_text("mine")
-    latch.path.unlink()
     latch.path.symlink_to(victim)
     latch.latch("again")
     assert victim.read_text() == "mine"
+    latch.clear()
+    assert not latch.is_set()
+    assert victim.exists()
+
+
+@pytest.mark.parametrize("path", ["/dev/null", "/dev/full", "/", "/dev"])
+def test_devices_and_folders_are_left_alone(path):
+    before = os.lstat(path)
+    latch = StopLatch(path)
+    latch.latch("now")
+    latch.obeyed()
+    with pytest.raises(NotCleared):
+        latch.clear()
+    assert os.lstat(path).st_ino == before.st_ino
+    Path(f"{path}.obeyed").unlink(missing_ok=True)
 
 
 def test_a_stop_that_cannot_be_replaced_is_latched_all_the_same(tmp_path):
