@@ -90,31 +90,43 @@ def steps_of(folder):
     return [int(row["step"]) for row in rows]
 
 
+def replaced(path, pid, times):
+    """Wait until a process has put so many new files in the place of ``path``; how long the last took."""
+    inode = path.stat().st_ino if path.exists() else 0
+    began = time.monotonic()
+    lasted = 0.0
+    while times:
+        assert Path(f"/proc/{pid}").exists()
+        if path.exists() and (now := path.stat().st_ino) != inode:
+            inode, times = now, times - 1
+            began, lasted = time.monotonic(), time.monotonic() - began
+        time.sleep(0.001)
+    return lasted
+
+
 def trained_and_killed(commands, folder, moments, draw):
     """Train, be killed, resume, be killed, ... The step of the last checkpoint after each time."""
-    found = [0]
+    found, between_s = [0], 0.1
     for moment in range(moments):
-        config = folder / "config.yaml"
-        written = config.stat().st_mtime_ns if config.exists() else 0
         pid = commands.start([*TRAIN, "steps=1000000", f"out={folder}"] if moment == 0 else ["train", f"resume={folder}", "progress=false"])
-        while not config.exists() or config.stat().st_mtime_ns == written:
-            assert Path(f"/proc/{pid}").exists(), commands.said.read_text()
-            time.sleep(0.005)
-        time.sleep(draw.uniform(0.0, 2.0))
+        replaced(folder / "config.yaml", pid, 1)
+        if count := draw.randrange(4):
+            between_s = replaced(folder / "checkpoint.pt", pid, count)
+        time.sleep(draw.uniform(0.0, between_s))  # sooner or later in what lies between two checkpoints
         os.kill(pid, signal.SIGKILL)
         assert commands.status() == -signal.SIGKILL
         assert len(temporaries(folder)) <= 1, "those of earlier kills are gone"
-        assert yaml.safe_load(config.read_text())["steps"] == 1_000_000
-        step = load_checkpoint(folder)["counters"]["step"] if (folder / "checkpoint.pt").exists() else 0
-        found.append(step)
-        assert sorted(set(steps := steps_of(folder))) == steps
+        assert yaml.safe_load((folder / "config.yaml").read_text())["steps"] == 1_000_000
+        found.append(load_checkpoint(folder)["counters"]["step"] if (folder / "checkpoint.pt").exists() else 0)
+        assert found[-1] >= found[-2] + 64 * count
+        if moment:
+            assert sorted(set(steps := steps_of(folder))) == steps
     return found
 
 
 @pytest.mark.parametrize("moments", [2, pytest.param(40, marks=pytest.mark.slow)])
 def test_a_training_killed_at_random_moments_goes_on_from_its_last_checkpoint(commands, tmp_path, moments):
     found = trained_and_killed(commands, tmp_path / "run", moments, random.Random(moments))
-    assert found == sorted(found)
     print(f"killed {moments} times, checkpoints at steps {found}")
     trainer = resumed(tmp_path / "run")
     assert trainer.counters.step == found[-1]

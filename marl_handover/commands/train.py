@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from marl_handover.errors import CheckpointMismatch, InvalidSetting, MissingFile
+from marl_handover.files import read_bounded
 from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.locks import claimed, new_folder
+from marl_handover.parsing import YAML_BYTES
 
 if TYPE_CHECKING:
     from marl_handover.learning.trainer import Trainer
@@ -86,7 +88,7 @@ def resumed(folder: Path, asked: TrainConfig | None = None) -> Trainer:
 
     unsaved = not (folder / FILE).exists() and (folder / "config.yaml").exists()
     source = folder / ("config.yaml" if unsaved else FILE)
-    text = source.read_text(encoding="utf-8", errors="replace") if unsaved else load_checkpoint(folder)["config"]
+    text = read_bounded(source, YAML_BYTES, "settings").decode(errors="replace") if unsaved else load_checkpoint(folder)["config"]
     config = train_config(text, source)
     asked = asked or TrainConfig(progress=False)
     own, wanted, default = (_flat(asdict(settings)) for settings in (config, asked, TrainConfig()))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from marl_handover.commands import train
 from marl_handover.config import bounded, check_bounds, chosen, name_field, path_field
 from marl_handover.errors import InvalidSetting
-from marl_handover.files import write_whole
+from marl_handover.files import read_bounded, write_whole
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.progress import say
 from marl_handover.resources import resource_path
@@ -93,7 +93,8 @@ def _search(config: TuneConfig) -> tuple[Search, Path]:
     out = Path(config.out or f"runs/tune/{name}")
     if out.exists() and not out.is_dir():
         raise InvalidSetting("out", str(out), "a folder; this is a file")
-    if (out / STUDY_FILE).is_file() and (owner := (out / STUDY_FILE).read_text(encoding="utf-8").strip()) != name:
+    owner = read_bounded(out / STUDY_FILE, 1000, "study").decode(errors="replace").strip() if (out / STUDY_FILE).exists() else name
+    if owner != name:
         raise InvalidSetting("out", str(out), f"a folder for study {name}; this one has the trials of study {owner}")
     origin = option_file("search", config.search or config.algorithm.name, resource_path("configs") / "search", None)
     space = load_space(origin, settings, config.fixed)

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from marl_handover.errors import HandoverError
-from marl_handover.files import write_whole
+from marl_handover.files import read_bounded, write_whole
 from marl_handover.learning.settings import TrainConfig
-from marl_handover.parsing import parse_json, read_json
+from marl_handover.parsing import LINES_BYTES, parse_json, read_json
 from marl_handover.policies.registry import content_hash
 from marl_handover.resources import package_path
 from marl_handover.runtime.assessment import AssessmentConfig
@@ -99,9 +99,8 @@ def contents_of(config: AssessmentConfig, own_run: bool) -> dict[str, str]:
     with suppress(HandoverError):
         if not own_run and (digest := content_hash(config.policy)):
             found["policy"] = digest
-    with suppress(OSError):
         if config.problems:
-            found["problems"] = hashlib.sha256(Path(config.problems).read_bytes()).hexdigest()[:12]
+            found["problems"] = hashlib.sha256(read_bounded(Path(config.problems), LINES_BYTES, "problems")).hexdigest()[:12]
     return found
 
 

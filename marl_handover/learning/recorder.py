@@ -14,7 +14,7 @@ from typing import Any
 from torch import Tensor
 
 from marl_handover.errors import Diverged
-from marl_handover.files import GrowingFile, write_whole
+from marl_handover.files import MEGABYTE, GrowingFile, read_bounded, write_whole
 from marl_handover.progress import Bar
 
 COLUMNS = (
@@ -60,8 +60,9 @@ class Recorder:
         """Rewrite the table with its header and the rows up to ``step``."""
         rows: list[list[str]] = []
         if step and self.path.exists():
-            with self.path.open(newline="", encoding="utf-8") as stream:
-                rows = [row for row in list(csv.reader(stream))[1:] if len(row) == len(COLUMNS) and int(row[0]) <= step]
+            text = read_bounded(self.path, 64 * MEGABYTE, "metrics").decode("utf-8", errors="replace")
+            found = csv.reader(text.splitlines())
+            rows = [row for row in found if len(row) == len(COLUMNS) and row[0].isdecimal() and int(row[0]) <= step]
         lines = [",".join(COLUMNS), *(",".join(row) for row in rows)]
         write_whole(self.path, "\n".join(lines) + "\n")
 

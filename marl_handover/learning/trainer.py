@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import multiprocessing
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from marl_handover.cell import load_cell
 from marl_handover.compose import to_yaml
-from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, first_line
+from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, WorkFailed, first_line
 from marl_handover.files import remove_temporaries, write_whole
 from marl_handover.learning.algorithm import subnormals_flushed
 from marl_handover.learning.algorithm_settings import OffPolicyConfig, PpoConfig
@@ -66,10 +67,14 @@ class Trainer:
         config: validated settings.
         folder: the run directory, made if it is not there.
         on_evaluation: called with the row of ``metrics.csv`` after each validation; what it raises ends the run, which stays resumable.
+
+    Raises:
+        NoSharedMemory: this machine has none.
     """
 
     def __init__(self, config: TrainConfig, folder: Path, on_evaluation: Callable[[dict[str, float]], object] = lambda row: None) -> None:
         config.validate()
+        require_shared_memory()
         self.config, self.folder, self.on_evaluation = config, folder, on_evaluation
         self.device = usable_device(config.device)
         torch.set_num_threads(config.threads)
@@ -292,6 +297,21 @@ class Trainer:
         self.best, self.losses = state["best"], state["losses"]
         self.generator.set_state(state["random"]["learner"].cpu())
         torch.set_rng_state(state["random"]["torch"].cpu())
+
+
+class NoSharedMemory(WorkFailed):
+    """A machine or a container without shared memory, which replay memories and the processes of collectors need."""
+
+    def __init__(self, error: OSError) -> None:
+        super().__init__(f"training needs shared memory, and /dev/shm cannot be used ({error.strerror or error}); mount a tmpfs there")
+
+
+def require_shared_memory() -> None:
+    """Raise :class:`NoSharedMemory` if no lock can be had that processes share."""
+    try:
+        multiprocessing.Lock()
+    except OSError as error:
+        raise NoSharedMemory(error) from error
 
 
 def _architecture(config_yaml: str) -> str:

@@ -30,13 +30,14 @@ from marl_handover.cell.build import urdf_path
 from marl_handover.compose import to_yaml
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.errors import CannotWrite, CorruptFile, HandoverError, MissingFile
-from marl_handover.files import cache_folder, writing
+from marl_handover.files import MEGABYTE, cache_folder, read_arrays, writing
 from marl_handover.progress import Bar
 from marl_handover.resources import package_path
 from marl_handover.task.rules import MotionCost, straight_line_mm
 
 Floats = NDArray[np.float64]
 
+LARGEST_BYTES = 64 * MEGABYTE
 SHIPPED = "pretrained/motion_cost.npz"
 RADII, YAWS, DISTANCES = 9, 25, 257
 """Nodes of the table along both radii, along the yaw between the places, and of the string along the distance."""
@@ -176,14 +177,12 @@ def read_table(path: Path, key: str) -> PathLengthTable:
     Raises:
         MissingFile, CorruptFile, StaleTable: if there is none, it is not whole, or it is another one.
     """
-    if not path.is_file():
-        raise MissingFile("path costs", path)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            stored = str(file["key"])
-            radii, string, excess = (np.asarray(file[name], float) for name in ("radii_mm", "string_mm", "excess_mm"))
-            table = PathLengthTable(stored, radii, float(file["span_rad"]), string, excess)
-    except Exception as error:  # numpy and zip raise many kinds
+        file = read_arrays(path, LARGEST_BYTES, "path costs")
+        stored = str(file["key"])
+        radii, string, excess = (np.asarray(file[name], float) for name in ("radii_mm", "string_mm", "excess_mm"))
+        table = PathLengthTable(stored, radii, float(file["span_rad"]), string, excess)
+    except (CorruptFile, KeyError, TypeError, ValueError) as error:
         raise CorruptFile("path costs", path, "damaged, or no such table; delete it and it is built again") from error
     if stored != key:
         raise StaleTable(path, stored, key)

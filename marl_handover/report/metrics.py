@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.errors import CorruptFile, MissingFile
+from marl_handover.files import read_bounded
+from marl_handover.parsing import LINES_BYTES
 
 Floats = NDArray[np.float64]
 Metrics = Mapping[str, Floats]
@@ -37,12 +39,12 @@ def read_metrics(run: Path) -> Metrics:
     if not run.exists():
         raise MissingFile("run directory", run)
     path = run / "metrics.csv" if run.is_dir() else run
-    if not path.is_file():
+    if not path.exists():
         raise MissingFile("metrics", path, "name a run directory that `train` wrote")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_bounded(path, LINES_BYTES, "metrics").decode("utf-8")
         lines = list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
-    except (OSError, ValueError, csv.Error) as error:
+    except (ValueError, csv.Error) as error:
         raise CorruptFile("metrics", path, str(error)) from error
     header = lines[0] if lines else []
     lacking = [name for name in NEEDED if name not in header]

@@ -10,10 +10,10 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from marl_handover.errors import CorruptFile, MissingFile
-from marl_handover.files import keep, make_folder, write_together
+from marl_handover.files import keep, make_folder, read_bounded, write_together
 from marl_handover.hardware.calibration import ArmCalibration, CalibrationProblem
 from marl_handover.hardware.settings import ARMS
-from marl_handover.parsing import read_json
+from marl_handover.parsing import JSON_BYTES, read_json
 from marl_handover.runtime.play import AGAIN, play_text
 from marl_handover.runtime.play import FILE as PLAY_FILE
 
@@ -77,4 +77,4 @@ def require_one_set(folder: Path, names: Collection[str] = NAMES) -> None:
 
 
 def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(read_bounded(path, JSON_BYTES, "servo calibration")).hexdigest()

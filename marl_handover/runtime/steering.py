@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import stat
 import threading
 import time
 from collections import deque
@@ -21,6 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.errors import CorruptFile, MissingFile
+from marl_handover.files import read_bounded
 from marl_handover.parsing import parse_json
 
 Floats = NDArray[np.float64]
@@ -136,17 +137,11 @@ class ControlFolder:
 
     def _read(self, path: Path) -> Answer | None:
         try:
-            found = os.stat(path)
-            if not stat.S_ISREG(found.st_mode):  # reading a pipe could take for ever
-                return Answer(-1, "", None, "the control file is no file")
-            if found.st_uid != os.getuid():
-                return Answer(-1, "", None, "the control file belongs to somebody else")
-            with path.open("rb") as stream:
-                content = parse_json(stream.read(_LARGEST_BYTES))
-        except FileNotFoundError:
+            content = parse_json(read_bounded(path, _LARGEST_BYTES, "control file", own=True), finite=False)
+        except MissingFile:
             return None
-        except (OSError, ValueError) as error:
-            return Answer(-1, "", None, f"the control file cannot be read: {error}"[:200])
+        except (CorruptFile, ValueError) as error:
+            return Answer(-1, "", None, f"it cannot be read: {error}"[:300])
         return self._judged(content)
 
     def _judged(self, content: Any) -> Answer:

@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -237,3 +238,15 @@ def test_a_run_killed_five_times_ends_as_an_uninterrupted_one(table, tmp_path):
     assert table(folder) == table(tmp_path / "whole")
     one, other = (load_checkpoint(path)["algorithm"]["loss"] for path in (tmp_path / "whole", folder))
     assert all(torch.equal(value, other[key]) for key, value in one.items())
+
+
+@pytest.mark.skipif(os.getuid() != 0 or not shutil.which("unshare"), reason="only root takes shared memory away")
+def test_a_machine_without_shared_memory_is_told(tmp_path):
+    code = "from marl_handover.learning.trainer import NoSharedMemory, require_shared_memory as r\n"
+    code += "try: r()\nexcept NoSharedMemory as e: print(e)"
+    # A file system in which no semaphore can be made, in a mount namespace of its own.
+    command = ["unshare", "-m", "sh", "-c", 'mount --bind /proc /dev/shm || exit 77; exec "$@"', "sh", sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode == 77:
+        pytest.skip("nothing can be mounted here")
+    assert "training needs shared memory, and /dev/shm cannot be used" in done.stdout, done.stderr

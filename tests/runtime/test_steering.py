@@ -73,7 +73,7 @@ def test_good_commands_are_taken_once(control):
         (dict(command="goal"), "x_mm, y_mm, theta_rad"),
         (dict(command="goal", goal=[1, 2]), "x_mm, y_mm, theta_rad"),
         (dict(command="goal", goal=[1, 2, float("inf")]), "x_mm, y_mm, theta_rad"),
-        (dict(command="goal", goal=[1, 2, 10**400]), "x_mm, y_mm, theta_rad"),
+        (dict(command="goal", goal=[1, 2, 10**400]), "401 digits"),
         (dict(command="goal", goal=[400, 0, 0]), "too far"),
         ([], "needs a number"),
         (b"{", "cannot be read"),
@@ -116,7 +116,7 @@ def test_commands_given_between_two_looks_are_all_taken_in_their_order(control):
 
 def test_what_cannot_be_removed_is_read_once(control):
     (control._folder / control_name(3)).mkdir()
-    assert "no file" in control.poll().refused
+    assert "it is a folder, not a regular file" in control.poll().refused
     assert control.poll() is None
     put(control, command(9))
     assert control.poll().refused is None
@@ -124,13 +124,13 @@ def test_what_cannot_be_removed_is_read_once(control):
 
 def test_a_file_of_somebody_else_is_refused(control, monkeypatch):
     put(control, command())
-    monkeypatch.setattr("os.getuid", lambda: 12345)
-    assert "somebody else" in control.poll().refused
+    monkeypatch.setattr("os.geteuid", lambda: 12345)
+    assert "another user" in control.poll().refused
 
 
 def test_a_pipe_in_place_of_the_file_is_refused_at_once(control):
     os.mkfifo(control._folder / control_name(1))
-    assert "no file" in control.poll().refused
+    assert "it is a FIFO, not a regular file" in control.poll().refused
 
 
 json_values = st.recursive(
