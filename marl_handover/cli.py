@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -61,6 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     ``debug=true`` among the arguments lets every exception through, with its traceback.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without some letter, a path of other bytes: shown by their codes
     if arguments[:1] == ["help"]:
         arguments = [*arguments[1:2], "--help"]
     name = arguments[0] if arguments else None
@@ -123,6 +126,7 @@ def _dispatch(name: str, arguments: list[str]) -> int:
     begun = (importlib.import_module(command.first).at_once(arguments),) if command.first else ()
     module: Any = importlib.import_module(command.module)
     from marl_handover.compose import compose, keys_help
+    from marl_handover.progress import showing
 
     if any(argument in ("--help", "-h") for argument in arguments):
         print(f"usage: {PROGRAM} {name} [key=value ...]\n\n{command.summary}\n\n{keys_help(module.SCHEMA, module.ALIASES, module.GROUPS)}")
@@ -131,7 +135,8 @@ def _dispatch(name: str, arguments: list[str]) -> int:
         if argument.startswith("-"):
             raise BadOverride(argument, "options are written key=value, without dashes; see --help")
     config = compose(module.SCHEMA, arguments, groups=module.GROUPS, aliases=module.ALIASES)
-    return int(getattr(module, command.function)(config, *begun))
+    with showing(getattr(config, "progress", True)):
+        return int(getattr(module, command.function)(config, *begun))
 
 
 def _take_debug(arguments: list[str]) -> tuple[bool, list[str]]:

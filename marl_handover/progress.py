@@ -22,6 +22,22 @@ QUIET_S = 2.0
 """What takes longer says what it is."""
 
 
+_silent: list[bool] = []
+"""Not empty: nothing is shown. Set by the command line, whose key ``progress`` is for all that its process shows."""
+
+
+@contextmanager
+def showing(shown: bool) -> Iterator[None]:
+    """Show bars and words on what takes long, or not, until the block ends."""
+    if not shown:
+        _silent.append(True)
+    try:
+        yield
+    finally:
+        if not shown:
+            _silent.pop()
+
+
 class Bar(tqdm):
     """A bar on stderr.
 
@@ -37,7 +53,7 @@ class Bar(tqdm):
         # A terminal that has no size says 0 columns, in which a bar would be nothing.
         sized = self._terminal and os.get_terminal_size(sys.stderr.fileno()).columns > 0
         size: dict[str, Any] = {"dynamic_ncols": True} if sized else {"ncols": 100, "nrows": 24}
-        super().__init__(*args, disable=not shown, file=sys.stderr, **size, **options)
+        super().__init__(*args, disable=bool(_silent) or not shown, file=sys.stderr, **size, **options)
 
     @staticmethod
     def status_printer(file: Any) -> Any:
@@ -87,6 +103,9 @@ def say(text: str) -> None:
 @contextmanager
 def working(what: str) -> Iterator[None]:
     """Tell on stderr ``what`` is being done, with the time it has taken, if that is longer than :data:`QUIET_S`."""
+    if _silent:
+        yield
+        return
     ended = threading.Event()
     teller = threading.Thread(target=_tell, args=(what, ended), daemon=True)
     teller.start()

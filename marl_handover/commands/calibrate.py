@@ -46,6 +46,7 @@ class CalibrateCommand(LabConfig):
     seed: int = seed_field()  # of the postures
     cell: CellConfig = field(default_factory=CellConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
+    progress: bool = True  # of what takes long, on stderr
 
 
 SCHEMA: type = CalibrateCommand

@@ -99,12 +99,23 @@ def _compiler() -> Iterator[str]:
     if not headers.is_file():
         major, minor = sys.version_info[:2]
         yield f"Python.h       none, so torch.compile cannot be used; run: apt install python{major}.{minor}-dev"
+    yield _film_encoder()
     try:
         from marl_handover.compiled import cache_place
     except ImportError:
         return
     place, trouble = cache_place()
     yield f"kernels        kept in {place}" if place else f"kernels        compiled anew each time: {trouble}; set NUMBA_CACHE_DIR=FOLDER"
+
+
+def _film_encoder() -> str:
+    """Where ffmpeg is: imageio-ffmpeg brings it along on most machines, and finds the system's on others."""
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        return f"ffmpeg         {get_ffmpeg_exe()}"
+    except (ImportError, RuntimeError):
+        return "ffmpeg         none, so no MP4 can be written (GIF can); install it, or set IMAGEIO_FFMPEG_EXE=FILE"
 
 
 def _listed(folder: str, pattern: str, otherwise: str) -> Iterator[str]:

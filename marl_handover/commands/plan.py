@@ -62,6 +62,7 @@ class PlanConfig:
     motion: str = path_field()  # file for the arms' motions: timed joint trajectories of every transfer
     motion_picture: str = path_field()  # file for a picture of them: .png, .pdf or .svg
     arm_motion: MotionConfig = field(default_factory=MotionConfig)  # how the arms move, for motion and motion_picture
+    progress: bool = True  # of what takes long, on stderr
 
 
 SCHEMA: type = PlanConfig

@@ -47,6 +47,7 @@ class RunCommand(LabConfig):
     task: TaskChanges = field(default_factory=TaskChanges)
     motion: MotionConfig = field(default_factory=MotionConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
+    progress: bool = True  # of what takes long, on stderr
 
 
 SCHEMA: type = RunCommand

@@ -60,6 +60,7 @@ class ViewCommand:
     cell: CellConfig | None = None  # single keys change the paper cell, or the one that the session's log names
     task: TaskChanges = field(default_factory=TaskChanges)
     motion: MotionConfig = field(default_factory=MotionConfig)
+    progress: bool = True  # of what takes long, on stderr
 
 
 SCHEMA: type = ViewCommand

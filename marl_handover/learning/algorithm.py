@@ -160,3 +160,50 @@ def subnormals_flushed() -> Iterator[None]:
         yield
     finally:
         torch.set_flush_denormal(False)
+
+
+class OwnTorch:
+    """Threads and random states of torch that a training has for itself: a context manager, after which the caller's are as they were.
+
+    What it left is there again the next time. Uses may nest; the outermost one counts.
+
+    Args:
+        threads: of the CPU.
+        seed: of the random states at first.
+        device: whose random state is meant, beside the CPU's.
+    """
+
+    def __init__(self, threads: int, seed: int, device: torch.device) -> None:
+        self._threads, self._seed = threads, seed
+        self._cuda = [torch.cuda.current_device() if device.index is None else device.index] if device.type == "cuda" else []
+        self._own: list[Tensor] | None = None
+        self._outer: tuple[int, list[Tensor]] | None = None
+        self._depth = 0
+
+    def __enter__(self) -> None:
+        self._depth += 1
+        if self._depth > 1:
+            return
+        self._outer = torch.get_num_threads(), self._states()
+        torch.set_num_threads(self._threads)
+        if self._own is None:
+            torch.manual_seed(self._seed)
+        else:
+            self._set(self._own)
+
+    def __exit__(self, *_: object) -> None:
+        self._depth -= 1
+        if self._depth or self._outer is None:
+            return
+        self._own = self._states()
+        threads, states = self._outer
+        torch.set_num_threads(threads)
+        self._set(states)
+
+    def _states(self) -> list[Tensor]:
+        return [torch.get_rng_state(), *(torch.cuda.get_rng_state(index) for index in self._cuda)]
+
+    def _set(self, states: list[Tensor]) -> None:
+        torch.set_rng_state(states[0])
+        for index, state in zip(self._cuda, states[1:], strict=True):
+            torch.cuda.set_rng_state(state, index)

@@ -19,7 +19,7 @@ from marl_handover.cell import load_cell
 from marl_handover.compose import to_yaml
 from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, WorkFailed, first_line
 from marl_handover.files import remove_temporaries, write_whole
-from marl_handover.learning.algorithm import subnormals_flushed
+from marl_handover.learning.algorithm import OwnTorch, subnormals_flushed
 from marl_handover.learning.algorithm_settings import OffPolicyConfig, PpoConfig
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
 from marl_handover.learning.curriculum import Curriculum
@@ -77,8 +77,12 @@ class Trainer:
         require_shared_memory()
         self.config, self.folder, self.on_evaluation = config, folder, on_evaluation
         self.device = usable_device(config.device)
-        torch.set_num_threads(config.threads)
-        torch.manual_seed(config.seed)
+        self.torch = OwnTorch(config.threads, config.seed, self.device)
+        with self.torch:
+            self._build()
+
+    def _build(self) -> None:
+        config = self.config
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
         load_cell(config.cell).require_pair("training")
         self.variant = make_variant(config.variant)
@@ -102,7 +106,7 @@ class Trainer:
             FolderBusy: another process trains in the folder.
             CannotWrite: there is no room for what it writes; the last checkpoint is whole.
         """
-        with claimed(self.folder):
+        with claimed(self.folder), self.torch:
             remove_temporaries(self.folder)
             self._train()
             return self._summarise()
@@ -246,6 +250,10 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint from which :meth:`restore` continues exactly."""
+        with self.torch:
+            self._save()
+
+    def _save(self) -> None:
         rows = self.replay[:].clone().to_dict() if len(self.replay) else None  # a slice would save the whole memory
         save_checkpoint(
             self.folder,
@@ -271,7 +279,8 @@ class Trainer:
         """Continue from the directory's checkpoint: networks, optimisers, replay, running episodes, random states, counters."""
         state = load_checkpoint(self.folder, self.device)
         try:
-            self._restore(state)
+            with self.torch:
+                self._restore(state)
         except HandoverError:
             raise
         except Exception as error:  # torch and what is made of the parts raise many kinds

@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from marl_handover.errors import InvalidSetting
 from marl_handover.files import make_folder, write_whole, writing
@@ -33,7 +34,11 @@ def save_figure(figure: Figure, path: Path, name: str = "out") -> None:
     # Without a date, the same picture is the same file.
     metadata = {".png": None, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}[suffix]
     # In this type text stays text, in a font that editors and publishers take.
-    with matplotlib.rc_context({"pdf.fonttype": 42}), writing(path) as stream:
+    # A user's text.usetex, made for notebooks, would need LaTeX here, and take our text for its markup.
+    for text in figure.findobj(Text):
+        text.set_usetex(False)
+        text.set_text(text.get_text().encode("utf-8", "replace").decode())  # a path of other bytes has letters that no font draws
+    with matplotlib.rc_context({"pdf.fonttype": 42, "text.usetex": False}), writing(path) as stream:
         figure.savefig(stream, format=suffix[1:], dpi=DOTS_PER_INCH, metadata=metadata)
 
 

@@ -91,7 +91,7 @@ def test_paths_expand_the_home_folder(tmp_path, monkeypatch, capsys):
     assert cli.main(["evaluate", "policy=shielded:~/none.npz"]) == 2
     assert str(tmp_path / "home" / "none.npz") in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["home"]
-    assert sorted(path.name for path in (tmp_path / "home").iterdir()) == ["e.json", "p.png", "t.jsonl", "w"]
+    assert {path.name for path in (tmp_path / "home").iterdir()} >= {"e.json", "p.png", "t.jsonl", "w"}
 
 
 def test_control_characters_of_an_argument_are_not_printed(capsys):
