@@ -21,6 +21,7 @@ from twin_limits import LimitWatch
 
 from marl_handover import policies
 from marl_handover.arrays import wrap
+from marl_handover.bounds import MAX_SEED
 from marl_handover.cli import main as command_line
 from marl_handover.errors import WorkFailed
 from marl_handover.learning.evaluation import random_problems
@@ -59,7 +60,7 @@ class Work(NamedTuple):
 def robot_changes(seed: int, robot: int, noise: float) -> dict[str, Any]:
     """Settings of a robot: all its seeds, its camera as somebody hung it, its errors multiplied by ``noise``."""
     random = np.random.default_rng([seed, robot])
-    drawn, config = int(random.integers(2**31)), twin_lab()
+    drawn, config = int(random.integers(2**31)) % (MAX_SEED + 1), twin_lab()
     changes = {"hardware.emulator.seed": drawn, "twin.seed": drawn}
     changes["mount.eye_mm"] = (np.array([0.0, 0.0, 700.0]) + random.uniform(-4, 4, 3)).round(2).tolist()
     changes["mount.tilt_deg"] = random.uniform(-0.35, 0.35, 2).round(3).tolist()
@@ -75,16 +76,23 @@ def read(config: Any, name: str) -> float:
     return float(config)
 
 
-def calibrated(folder: Path, values: dict[str, Any], robot: int) -> LabConfig:
-    """The robot's settings, once `calibrate` has been run on it; its files are kept."""
-    changes, config = robot_changes(int(values["seed"]), robot, float(values["noise"])), twin_lab()
-    changes["hardware.stop_file"], kept = str(folder / "stop"), folder / "calibration"
+def changed(changes: dict[str, Any]) -> LabConfig:
+    """The twin as it is shipped, but for ``changes`` by their dotted names."""
+    config = twin_lab()
     for name, value in changes.items():
         *path, last = name.split(".")
         part: Any = config
         for step in path:
             part = getattr(part, step)
         setattr(part, last, value)
+    return config
+
+
+def calibrated(folder: Path, values: dict[str, Any], robot: int) -> LabConfig:
+    """The robot's settings, once `calibrate` has been run on it; its files are kept."""
+    changes, kept = robot_changes(int(values["seed"]), robot, float(values["noise"])), folder / "calibration"
+    changes["hardware.stop_file"] = str(folder / "stop")
+    config = changed(changes)
     config.calibration = str(kept)
     if not is_calibrated(kept):
         folder.mkdir(parents=True, exist_ok=True)

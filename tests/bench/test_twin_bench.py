@@ -45,6 +45,14 @@ def armed(tmp_path: Path) -> Any:
     twin.close()
 
 
+@pytest.mark.parametrize("noise", [0.0, 1.0, 2.0])
+def test_settings_of_every_robot_are_allowed(noise: float) -> None:
+    for robot in range(20):
+        config = twin_work.changed(twin_work.robot_changes(0, robot, noise))
+        config.hardware.validate()
+        config.twin.validate()
+
+
 def test_an_ordinary_motion_is_within_limits_and_close_to_them_is_said(armed: Any) -> None:
     _, driver, watch = armed
     driver.drive(0, PARKED + np.radians([25.0, 0, 0, 0, 0]), driver.gripper_mm(0), 60.0)
