@@ -23,11 +23,11 @@ from tqdm import tqdm
 from marl_handover.cell.arm import REACH_TOLERANCE_MM
 from marl_handover.cell.build import build_cell, cell_config
 from marl_handover.learning.evaluation import random_problems
-from marl_handover.learning.rollout import Decision, play
 from marl_handover.motion.path_length_table import path_length_table
 from marl_handover.motion.path_optimizer import NoPath
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import SupervisorPolicy, load
+from marl_handover.task.episode import Decision, play
 from marl_handover.task.rules import Outcome
 
 DEFAULTS = {

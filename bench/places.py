@@ -18,7 +18,7 @@ from marl_handover.cell import Cell
 from marl_handover.errors import HandoverError
 from marl_handover.files import write_whole
 from marl_handover.learning.evaluation import evaluate, random_problems
-from marl_handover.learning.rollout import Decision
+from marl_handover.task.episode import Decision
 
 NEAR_MM = 4.0
 """Two standard deviations of the noise that the suites judge with."""

@@ -17,10 +17,10 @@ from marl_handover.config import TaskConfig
 from marl_handover.errors import CorruptFile, MissingFile, UnknownChoice
 from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.export import policy_arrays, run_arrays, save_policy
-from marl_handover.learning.rollout import play
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.trainer import Trainer
 from marl_handover.learning.variants import Variant
+from marl_handover.task.episode import play
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Outcome, Rules
 

@@ -8,8 +8,8 @@ import pytest
 from marl_handover import policies
 from marl_handover.config import TaskConfig
 from marl_handover.errors import CheckpointMismatch, UnknownChoice
-from marl_handover.learning.rollout import play
 from marl_handover.policies import ShieldedPolicy, SupervisorPolicy
+from marl_handover.task.episode import play
 from marl_handover.task.rules import Outcome
 from tests.symmetries import GROUP
 

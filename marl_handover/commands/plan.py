@@ -29,8 +29,8 @@ from marl_handover.config import (
     seed_field,
 )
 from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, WorkFailed
-from marl_handover.learning.rollout import nobody_moves
 from marl_handover.policies import SupervisorPolicy, adapted
+from marl_handover.task.episode import advance
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Outcome, Rules, Transition
 from marl_handover.wording import counted
@@ -175,22 +175,21 @@ def solve(policy: SupervisorPolicy, start: Floats, goal: Floats) -> dict[str, An
     pose, outcome = start, Outcome.NONE
     previous: Any = np.int64(NO_ARM)
     transfers: list[dict[str, Any]] = []
-    limit, waiting = rules.config.max_steps, False
-    while outcome is Outcome.NONE and not waiting and len(transfers) < limit:
+    waiting, over = False, False
+    while not over:
         action = policy.act(pose, goal, previous)
-        result = rules.step(pose, goal, previous, action, transfers_left=np.int64(limit - len(transfers)))
-        external = int(result.external_arm)
-        waiting = external < 0 and bool(nobody_moves(action))
+        stepped = advance(rules, pose, goal, previous, action, np.int64(len(transfers)), may_wait=True)
+        result, over, waiting = stepped.result, bool(stepped.over), bool(stepped.idle)
+        outcome = Outcome(int(stepped.outcome))
         if waiting:
-            continue
+            break
+        external = int(result.external_arm)
         if int(result.transfers) > (external >= 0):
             transfers.append(_commanded(rules, pose, goal, result))
         if external >= 0:
             path_mm = float(rules.motion_cost(rules.cell, np.int64(external), result.placed[:2], result.pose[:2]))
             transfers.append(_transfer(rules, external, True, result.placed, result.pose, path_mm, None))
         pose, previous = result.pose, result.previous_arm
-        if result.terminated:
-            outcome = Outcome(int(result.outcome))
     optimum = int(ExactPlanner(rules).plan(start, goal).transfers)
     return {
         "policy": policy.name,
@@ -201,7 +200,7 @@ def solve(policy: SupervisorPolicy, start: Floats, goal: Floats) -> dict[str, An
         "epsilon_deg": rules.config.epsilon_deg,
         "symmetry_order": rules.config.symmetry_order,
         "optimal_transfers": optimum or None,
-        "outcome": (Outcome.TIMEOUT if outcome is Outcome.NONE else outcome).name.lower(),
+        "outcome": outcome.name.lower(),
         "transfers": transfers,
         "waiting": waiting,
         "total_path_mm": sum(transfer["path_mm"] for transfer in transfers),

@@ -19,6 +19,7 @@ from marl_handover.envs.problem_source import ProblemSource
 from marl_handover.envs.top_view import TopView
 from marl_handover.errors import InvalidSetting, NotFinite, UnknownKey
 from marl_handover.motion.path_length_table import motion_cost
+from marl_handover.task.episode import advance
 from marl_handover.task.observations import observation_size, observe
 from marl_handover.task.rules import Outcome, Rules
 
@@ -113,24 +114,16 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         """Execute one command; see :class:`marl_handover.task.rules.Rules`."""
         if not np.isfinite(action).all():
             raise NotFinite("action", list(action))
-        left = np.asarray(self.rules.config.max_steps - self._transfers)
-        result = self.rules.step(
-            self._pose,
-            self._goal,
-            self._previous,
-            np.asarray(action, np.float64),
-            transfers_left=left,
-            noise=self._noise(),
-            final_noise=self._noise(),
-        )
+        made, numbers = np.asarray(self._transfers), np.asarray(action, np.float64)
+        noise, final_noise = self._noise(), self._noise()
+        stepped = advance(self.rules, self._pose, self._goal, self._previous, numbers, made, noise=noise, final_noise=final_noise)
+        result, room = stepped.result, bool(made < self.rules.config.max_steps - 1)
         penalty = self.rules.motion_penalty(result.command.arm, self._pose, result.placed)
         self._pose, self._previous = result.pose, result.previous_arm
-        self._transfers += int(result.transfers)
-        terminated = bool(result.terminated)
-        truncated = not terminated and self._transfers >= self.rules.config.max_steps
-        outcome = Outcome.TIMEOUT if truncated else Outcome(int(result.outcome))
-        info = self._info(bool(result.feasible), bool(result.command.final), outcome, float(penalty))
-        info["room"] = bool(left > 1) or (int(result.transfers) == 1 and int(result.external_arm) >= 0)
+        self._transfers = int(stepped.transfers)
+        terminated, truncated = bool(result.terminated), bool(stepped.truncated)
+        info = self._info(bool(result.feasible), bool(result.command.final), Outcome(int(stepped.outcome)), float(penalty))
+        info["room"] = room or (int(result.transfers) == 1 and int(result.external_arm) >= 0)
         return self._observation(), float(result.reward), terminated, truncated, info
 
     def compute_reward(

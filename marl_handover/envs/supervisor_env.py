@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import TaskConfig, require_at_least, require_positive
 from marl_handover.motion.path_length_table import motion_cost
+from marl_handover.task.episode import advance
 from marl_handover.task.observations import observation_size, observe
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules, carried
@@ -144,22 +145,11 @@ class SupervisorEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         pose, goal = tensordict["achieved_goal"], tensordict["desired_goal"]
-        epsilon, transfers = tensordict["epsilon"][:, 0], tensordict["transfers"]
-        limit = self.rules.config.max_steps
-        result = self.rules.step(
-            pose,
-            goal,
-            tensordict["previous_arm"][:, 0],
-            tensordict["action"],
-            transfers_left=limit - transfers[:, 0],
-            epsilon_rad=epsilon,
-            noise=self._noise(),
-            final_noise=self._noise(),
-        )
-        transfers = transfers + result.transfers[:, None]
-        terminated = result.terminated[:, None]
-        truncated = (transfers >= limit) & ~terminated
-        outcome = torch.where(truncated, int(Outcome.TIMEOUT), result.outcome[:, None])
+        epsilon, made = tensordict["epsilon"][:, 0], tensordict["transfers"][:, 0]
+        previous, action = tensordict["previous_arm"][:, 0], tensordict["action"]
+        noise, final_noise = self._noise(), self._noise()
+        stepped = advance(self.rules, pose, goal, previous, action, made, epsilon_rad=epsilon, noise=noise, final_noise=final_noise)
+        result, terminated, truncated = stepped.result, stepped.result.terminated[:, None], stepped.truncated[:, None]
         observation = self.observe(result.pose, goal, result.previous_arm, epsilon)
         return TensorDict(
             {
@@ -168,10 +158,10 @@ class SupervisorEnv(EnvBase):
                 "desired_goal": goal,
                 "previous_arm": result.previous_arm[:, None],
                 "epsilon": tensordict["epsilon"],
-                "transfers": transfers,
+                "transfers": stepped.transfers[:, None],
                 "placed": result.placed,
                 "feasible": result.feasible[:, None],
-                "outcome": outcome,
+                "outcome": stepped.outcome[:, None],
                 "reward": result.reward[:, None],
                 "done": terminated | truncated,
                 "terminated": terminated,

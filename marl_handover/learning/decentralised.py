@@ -15,10 +15,10 @@ from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.algorithm import Algorithm
 from marl_handover.learning.decentralised_sac import DecentralisedSac
 from marl_handover.learning.experience import BatchedExperience, Experience
-from marl_handover.learning.rollout import Act
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.turn_replay import TurnReplay
 from marl_handover.learning.variants import Variant
+from marl_handover.task.episode import Act
 from marl_handover.task.observations import observe
 
 

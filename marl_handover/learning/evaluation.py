@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from marl_handover.arrays import wrap
 from marl_handover.errors import CorruptFile, NotFinite, OutOfReach
 from marl_handover.files import read_bounded
-from marl_handover.learning.rollout import Act, Episodes, Noise, Observer, play
 from marl_handover.parsing import LINES_BYTES, parse_object
+from marl_handover.task.episode import Act, Episodes, Noise, Observer, play
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules, carried

@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.learning.rollout import Decision
+from marl_handover.task.episode import Decision
 from marl_handover.task.rules import Outcome, Rules
 
 

@@ -27,8 +27,8 @@ from marl_handover.learning.experience import BatchedExperience, Experience
 from marl_handover.learning.hybrid_sac import HybridSac
 from marl_handover.learning.ppo import Ppo
 from marl_handover.learning.replay import HindsightReplayBuffer
-from marl_handover.learning.rollout import Act, Episodes, play
 from marl_handover.learning.settings import VARIANTS, TrainConfig
+from marl_handover.task.episode import Act, Episodes, play
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Rules, carried
 

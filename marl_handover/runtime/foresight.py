@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from marl_handover.learning.rollout import nobody_moves
 from marl_handover.policies import SupervisorPolicy
+from marl_handover.task.episode import advance
 
 Floats = NDArray[np.float64]
 
@@ -32,20 +32,20 @@ def foresee(policy: SupervisorPolicy, pose: ArrayLike, goal: ArrayLike, previous
     """
     rules, here, there = policy.rules, np.asarray(pose, float), np.asarray(goal, float)
     previous = np.int64(previous_arm)
-    limit = rules.config.max_steps
     ahead: list[Placement] = []
-    while len(ahead) < limit:
+    over = False
+    while not over:
         action = policy.act(here, there, np.asarray(previous))
-        early = rules.external_finish and bool(rules.can_finish(here, there).any())
-        if bool(nobody_moves(action)) and not early:
+        stepped = advance(rules, here, there, previous, action, np.int64(len(ahead)), may_wait=True)
+        result, over = stepped.result, bool(stepped.over)
+        if bool(stepped.idle):
             break
-        result = rules.step(here, there, previous, action, transfers_left=np.int64(limit - len(ahead)))
         external = int(result.external_arm)
         if bool(result.feasible):
             ahead.append(Placement(np.array(result.placed, float), int(result.command.arm), bool(result.command.final)))
         if external >= 0:
             ahead.append(Placement(np.array(result.pose, float), external, True))
-        if bool(result.terminated) or not (bool(result.feasible) or external >= 0):
+        if not (bool(result.feasible) or external >= 0):
             break
         here, previous = np.asarray(result.pose, float), result.previous_arm
     return ahead

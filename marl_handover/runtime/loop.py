@@ -19,7 +19,6 @@ from marl_handover.config import LoopConfig, MotionConfig
 from marl_handover.envs.backends import Backend, make_backend
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.errors import HandoverError
-from marl_handover.learning.rollout import nobody_moves
 from marl_handover.motion.executor import ROLL_RAD
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.motion.planner import MotionPlanner
@@ -28,6 +27,7 @@ from marl_handover.policies import SupervisorPolicy
 from marl_handover.runtime.episode import SAME_MM, SAME_RAD, Done, Episode, Order, Transfer, finishing, moved, ordered
 from marl_handover.runtime.reach import drawn_in
 from marl_handover.runtime.watching import Haltable, Inset, Truthful, Watchful
+from marl_handover.task.episode import nobody_moves
 from marl_handover.task.rules import Outcome, Rules, Verdict
 
 Floats = NDArray[np.float64]

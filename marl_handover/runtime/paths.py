@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from marl_handover.arrays import one_where
 from marl_handover.config import MotionConfig
 from marl_handover.envs.centralised import CentralisedRules, MotionCommand
-from marl_handover.learning.rollout import Decision
 from marl_handover.motion.path_length_table import known_table
+from marl_handover.task.episode import Decision
 from marl_handover.task.rules import Rules
 
 CHUNK = 2000

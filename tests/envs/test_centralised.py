@@ -10,8 +10,8 @@ from marl_handover.config import CentralisedConfig, RewardConfig, TaskConfig
 from marl_handover.envs.centralised import CentralisedRules, MotionCommand
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.errors import InvalidSetting, UnknownChoice
-from marl_handover.learning.rollout import play
 from marl_handover.policies import load
+from marl_handover.task.episode import play
 from marl_handover.task.rules import Command, Outcome, Rules
 
 NUMBERS = 20

@@ -15,11 +15,11 @@ from marl_handover.envs.decentralised import DecentralisedEnv
 from marl_handover.errors import InvalidSetting
 from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.decentralised import Decentralised
-from marl_handover.learning.rollout import play
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.trainer import Trainer
 from marl_handover.learning.turn_networks import PASS, PLACE
 from marl_handover.policies import ExactPolicy
+from marl_handover.task.episode import play
 from marl_handover.task.observations import ARM_FIELDS
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome

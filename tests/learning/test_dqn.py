@@ -11,10 +11,10 @@ from marl_handover import policies
 from marl_handover.errors import InvalidSetting
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.learning.export import policy_arrays, run_arrays, save_policy
-from marl_handover.learning.rollout import play
 from marl_handover.learning.trainer import Trainer
 from marl_handover.policies import RandomPolicy
 from marl_handover.policies.discrete import DiscretePolicy
+from marl_handover.task.episode import play
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Outcome
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from marl_handover.errors import Diverged
-from marl_handover.learning.rollout import play
 from marl_handover.learning.trainer import Trainer
 from marl_handover.policies import RandomPolicy
+from marl_handover.task.episode import play
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome
 

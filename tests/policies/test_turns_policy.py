@@ -19,12 +19,12 @@ from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.decentralised import Decentralised
 from marl_handover.learning.evaluation import evaluate
 from marl_handover.learning.export import policy_arrays, run_arrays, save_policy
-from marl_handover.learning.rollout import nobody_moves, play
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.trainer import Trainer
 from marl_handover.learning.turn_networks import FINISH, PASS, PLACE
 from marl_handover.policies import decentralised
 from marl_handover.policies.policy import NobodyMoves
+from marl_handover.task.episode import nobody_moves, play
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Outcome
 

@@ -14,10 +14,10 @@ from marl_handover.envs.backends import Execution, KinematicBackend, NoisyBacken
 from marl_handover.envs.cycle_check import END_TOLERANCE_MM, Refusal
 from marl_handover.errors import InvalidSetting, UnknownChoice
 from marl_handover.learning.evaluation import random_problems
-from marl_handover.learning.rollout import play
 from marl_handover.motion.path_length_table import cache_file, path_length_table, settings_key
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.runtime.loop import ClosedLoop, make_loop
+from marl_handover.task.episode import play
 from marl_handover.task.rules import Outcome, Rules
 
 MOTION = MotionConfig()

@@ -11,12 +11,12 @@ from marl_handover.config import CellConfig, CentralisedConfig, MotionConfig, Ta
 from marl_handover.envs.centralised import CentralisedRules
 from marl_handover.envs.cycle_check import CycleCheck
 from marl_handover.learning.evaluation import random_problems
-from marl_handover.learning.rollout import Decision, play
 from marl_handover.motion.batched_paths import ends_of
 from marl_handover.motion.path_length_table import known_table
 from marl_handover.policies import load
 from marl_handover.runtime.assessment import AssessmentConfig, assess
 from marl_handover.runtime.paths import PathLengths
+from marl_handover.task.episode import Decision, play
 
 
 def test_executors_travel_what_the_table_says():

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from marl_handover.cell.build import CellModel
 from marl_handover.config import LoopConfig, MotionConfig
 from marl_handover.errors import InvalidSetting
-from marl_handover.learning.rollout import nobody_moves
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.runtime.episode import Order, finishing, moved, ordered
-from marl_handover.runtime.foresight import Placement
+from marl_handover.runtime.episode import Order, finishing, ordered
+from marl_handover.runtime.foresight import Placement, foresee
+from marl_handover.task.episode import nobody_moves
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Outcome, Rules, carried
 
@@ -72,17 +72,12 @@ class Decider:
 
     def rollout(self, pose: Floats, goal: Floats, previous: int, first: Order | None) -> tuple[Placement, ...]:
         """The placements from ``pose`` (3,) on, if everybody does as told; ``first`` has been ordered already."""
-        plan: list[Placement] = []
-        order = first
-        while order is not None and order.feasible:
-            plan.append(Placement(order.predicted, order.arm, order.final))
-            pose, previous = order.predicted, order.arm
-            if self.there(pose, goal) or len(plan) >= self.rules.config.max_steps:
-                break
-            before, order = order, self.order(pose, goal, previous)
-            if order is not None and order.arm == before.arm and not moved(pose, order.predicted):
-                break
-        return tuple(plan)
+        if first is None or not first.feasible:
+            return ()
+        plan = [Placement(first.predicted, first.arm, first.final)]
+        if not self.there(first.predicted, goal):
+            plan += foresee(self.policy, first.predicted, goal, first.arm)
+        return tuple(plan[: self.rules.config.max_steps])
 
 
 @dataclass

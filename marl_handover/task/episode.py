@@ -1,4 +1,8 @@
-"""Playing whole episodes of a policy on the batched rules, numpy or torch alike."""
+"""An episode under the rule book, decision by decision: the one stepper of exact arms, numpy or torch, one problem or a batch.
+
+:func:`advance` takes a decision, counts transfers and tells when an episode is over; :func:`play` does so to the end for a whole batch.
+Environments, plans and what a policy means to do next use the first, evaluation the second.
+"""
 
 from __future__ import annotations
 
@@ -40,6 +44,56 @@ class Decision(NamedTuple):
 Observer = Callable[[Decision], None]
 
 
+class Stepped(NamedTuple):
+    """What a decision did within an episode, each (...).
+
+    ``result``; ``transfers`` made so far; ``truncated``: none is left, without a verdict; ``outcome``: that of the result, or a time-out;
+    ``idle``: no arm was to move.
+    """
+
+    result: Transition
+    transfers: Array
+    truncated: Array
+    outcome: Array
+    idle: Array
+
+    @property
+    def over(self) -> Array:
+        """Whether the episode ends here."""
+        return self.result.terminated | self.truncated
+
+
+def advance(
+    rules: Rules,
+    pose: Array,
+    goal: Array,
+    previous_arm: Array,
+    action: Array,
+    made: Array,
+    *,
+    epsilon_rad: Array | float | None = None,
+    noise: Array | None = None,
+    final_noise: Array | None = None,
+    may_wait: bool = False,
+) -> Stepped:
+    """One decision of episodes that have ``made`` (...) transfers; the other arguments are those of :meth:`Rules.step`.
+
+    ``may_wait``: an action that is not a number says that no arm is to move. A policy that says so of the same object will never move one:
+    a time-out at once. There is no transfer then, but the episode has used up all it had, or waiting for ever would be the quickest end.
+    """
+    xp, limit = namespace(pose), rules.config.max_steps
+    left = limit - made
+    result = rules.step(
+        pose, goal, previous_arm, action, transfers_left=left, epsilon_rad=epsilon_rad, noise=noise, final_noise=final_noise
+    )
+    total, idle = made + result.transfers, result.terminated & ~result.terminated
+    if may_wait:
+        idle = nobody_moves(action) & (result.external_arm < 0)
+        result, total = _without(result, idle), xp.where(idle, limit, total)
+    truncated = ~result.terminated & (total >= limit)
+    return Stepped(result, total, truncated, xp.where(truncated, int(Outcome.TIMEOUT), result.outcome), idle)
+
+
 def play(
     rules: Rules,
     act: Act,
@@ -49,13 +103,9 @@ def play(
     noise: Noise | None = None,
     observer: Observer | None = None,
 ) -> Episodes:
-    """Play every problem, pose and goal (n, 3), to its end. Only running episodes are computed.
-
-    Where no arm is to move, a policy that says the same of the same object will never move one: a time-out at once. The decision that the
-    observer sees has no transfer, but the episode has used up all it had, or waiting for ever would be the quickest way to end.
-    """
+    """Play every problem, pose and goal (n, 3), to its end. Only running episodes are computed."""
     xp = namespace(pose)
-    count, limit = len(pose), rules.config.max_steps
+    count = len(pose)
     zero = xp.zeros_like(pose[:, 0])
     outcome = xp.where(zero == 0, int(Outcome.TIMEOUT), 0)
     transfers = xp.where(zero == 0, 0, 1)
@@ -64,28 +114,19 @@ def play(
     ended = pose
     while len(running):
         here, there = pose, goal
-        action = act(here, there, previous)
         made = transfers[running]
-        result = rules.step(
-            here,
-            there,
-            previous,
-            action,
-            transfers_left=limit - made,
-            epsilon_rad=epsilon_rad,
-            noise=None if noise is None else noise(len(here)),
-            final_noise=None if noise is None else noise(len(here)),
+        action = act(here, there, previous)
+        noises = [None if noise is None else noise(len(here)) for _ in range(2)]
+        stepped = advance(
+            rules, here, there, previous, action, made, epsilon_rad=epsilon_rad, noise=noises[0], final_noise=noises[1], may_wait=True
         )
-        idle = nobody_moves(action) & (result.external_arm < 0)
-        result = _without(result, idle)
+        result = stepped.result
         if observer is not None:
             observer(Decision(running, here, there, previous, made, result))
-        total = xp.where(idle, limit, made + result.transfers)
-        over = result.terminated | (total >= limit)
         verdict = xp.where(result.terminated, result.outcome, int(Outcome.TIMEOUT))
-        outcome, transfers = _put(outcome, running, verdict), _put(transfers, running, total)
+        outcome, transfers = _put(outcome, running, verdict), _put(transfers, running, stepped.transfers)
         ended = _put(ended, running, result.pose)
-        going = ~over
+        going = ~stepped.over
         running, pose, goal, previous = running[going], result.pose[going], there[going], result.previous_arm[going]
     return Episodes(outcome, transfers, ended)
 
