@@ -1,7 +1,7 @@
 # Needs Linux, make and Python 3.11 (or 3.12) with venv and pip; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow fuzz check format bench docs pretrained wheel clean
+.PHONY: help demo test test-slow test-lowest fuzz check format bench docs pretrained wheel clean
 
 SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
 PYTHON ?= $(firstword $(foreach p,python3.11 python3 python3.12,$(shell $(p) -c "$(SUITABLE)" 2>/dev/null && echo $(p))))
@@ -16,6 +16,7 @@ help:
 	@echo "make demo       install, train a supervisor, evaluate it against the exact planner, leave pictures in runs/"
 	@echo "make test       install and run the tests; make test-slow the slow ones (wheel, SIGKILL, longer learners)"
 	@echo "make fuzz       20,000 random command lines over every key of every command, in one process (an hour or two)"
+	@echo "make test-lowest the tests with the lowest versions that pyproject.toml allows, in .venv-lowest"
 	@echo "make check      style, types and import layers; make format repairs the style"
 	@echo "make bench      measure motion planning, speed, and learning against Stable-Baselines3 (hours)"
 	@echo "make docs       build the documentation site into site/; warnings are errors"
@@ -46,6 +47,13 @@ test-slow: $(STAMP)
 
 fuzz: $(STAMP)
 	$(ONE_THREAD) $(BIN)/python tests/fuzz_command_lines.py 20000
+
+# Every lower bound of pyproject.toml at once; UV_TORCH_BACKEND=cpu spares a CUDA build where PyTorch's own index can be reached.
+test-lowest:
+	$(PYTHON) -m venv --clear .venv-lowest
+	.venv-lowest/bin/python -m pip install --quiet --disable-pip-version-check uv
+	.venv-lowest/bin/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct -e ".[dev,peers,ompl]"
+	$(ONE_THREAD) .venv-lowest/bin/python -m pytest -q -n $(WORKERS)
 
 check: $(STAMP)
 	$(BIN)/ruff check .
@@ -79,4 +87,4 @@ wheel: $(STAMP)
 	$(BIN)/python -m build --wheel --outdir dist .
 
 clean:
-	rm -rf .venv build dist site .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache
+	rm -rf .venv .venv-lowest build dist site .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache

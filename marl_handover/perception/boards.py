@@ -9,12 +9,15 @@ import cv2
 import numpy as np
 
 from marl_handover.config import BlockConfig
-from marl_handover.errors import InvalidSetting
+from marl_handover.errors import HandoverError, InvalidSetting
 from marl_handover.perception.calibration import Floats, Pixels
 from marl_handover.perception.settings import BoardConfig, TargetConfig
+from marl_handover.requirements import install_line
 
 _NAMES = {"16h5": "DICT_APRILTAG_16h5", "25h9": "DICT_APRILTAG_25h9", "36h11": "DICT_APRILTAG_36h11"}
 WHITE, BLACK = 255, 0
+TRUE_CORNERS = (4, 14)
+"""The first OpenCV that counts the middle of a pixel alike when it finds a board's corners and when it projects them."""
 
 
 class Sheet(NamedTuple):
@@ -25,9 +28,22 @@ class Sheet(NamedTuple):
     height_mm: float
 
 
+class OldOpenCV(HandoverError):
+    """An OpenCV that puts the printed corners of a board half a pixel off: cameras calibrated with it would be off in silence."""
+
+    def __init__(self, version: str) -> None:
+        super().__init__(f"OpenCV {version} finds corners half a pixel off; run: {install_line(only=['opencv-python-headless'])}")
+
+
 @lru_cache(maxsize=8)
 def dictionary(name: str) -> Any:
-    """OpenCV's marker dictionary of one of ``settings.DICTIONARIES``."""
+    """OpenCV's marker dictionary of one of ``settings.DICTIONARIES``.
+
+    Raises:
+        OldOpenCV: another package may have brought its own OpenCV, which then takes the place of the one that is asked for.
+    """
+    if tuple(map(int, cv2.__version__.split(".")[:2])) < TRUE_CORNERS:
+        raise OldOpenCV(cv2.__version__)
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, _NAMES.get(name, "DICT_" + name.upper())))
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from marl_handover.config import BlockConfig
 from marl_handover.errors import InvalidSetting, UnknownChoice
-from marl_handover.perception.boards import block_top, board_corners_mm, charuco_sheet, dictionary, marker_cells, marker_sheet
+from marl_handover.perception.boards import OldOpenCV, block_top, board_corners_mm, charuco_sheet, dictionary, marker_cells, marker_sheet
 from marl_handover.perception.intrinsics import BoardFinder
 from marl_handover.perception.settings import BoardConfig, TargetConfig
 
@@ -47,3 +47,11 @@ def test_markers_and_boards_that_cannot_be_are_refused():
         charuco_sheet(BoardConfig(dictionary="7h3"))
     with pytest.raises(InvalidSetting, match="marker_mm"):
         charuco_sheet(BoardConfig(marker_mm=31))
+
+
+@pytest.mark.parametrize("version", ["4.12.0", "4.13.0", "4.9.0-dev"])
+def test_an_opencv_that_finds_corners_elsewhere_is_refused(monkeypatch, version):
+    dictionary.cache_clear()
+    monkeypatch.setattr(cv2, "__version__", version)
+    with pytest.raises(OldOpenCV, match=r"half a pixel off; run: pip install 'opencv-python-headless>=5'"):
+        BoardFinder(BoardConfig())
