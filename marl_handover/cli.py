@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from marl_handover.errors import BadOverride, HandoverError, exit_status_of, shortened, shown
+from marl_handover.progress import working
 
 PROGRAM = "marl-handover"
 LONGEST_LINE = 300
@@ -124,7 +125,8 @@ def _output_lost() -> bool:
 def _dispatch(name: str, arguments: list[str]) -> int:
     command = COMMANDS[name]
     begun = (importlib.import_module(command.first).at_once(arguments),) if command.first else ()
-    module: Any = importlib.import_module(command.module)
+    with working("loading the libraries", logged=False):
+        module: Any = importlib.import_module(command.module)
     from marl_handover.compose import compose, keys_help
     from marl_handover.progress import showing
 

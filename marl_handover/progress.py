@@ -101,9 +101,12 @@ def say(text: str) -> None:
 
 
 @contextmanager
-def working(what: str) -> Iterator[None]:
-    """Tell on stderr ``what`` is being done, with the time it has taken, if that is longer than :data:`QUIET_S`."""
-    if _silent:
+def working(what: str, *, logged: bool = True) -> Iterator[None]:
+    """Tell on stderr ``what`` is being done, with the time it has taken, if that is longer than :data:`QUIET_S`.
+
+    ``logged``: also if stderr is no terminal, in one line.
+    """
+    if _silent or not (logged or sys.stderr.isatty()):
         yield
         return
     ended = threading.Event()

@@ -14,6 +14,7 @@ from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.locks import claimed, new_folder
 from marl_handover.parsing import YAML_BYTES
+from marl_handover.progress import working
 
 if TYPE_CHECKING:
     from marl_handover.learning.trainer import Trainer
@@ -53,7 +54,8 @@ def run(config: TrainConfig) -> int:
 
 def _begun(config: TrainConfig) -> Trainer:
     """A trainer of a new run, in ``out`` or in a folder of its own; bad settings make none."""
-    from marl_handover.learning.trainer import Trainer
+    with working("loading the libraries", logged=False):
+        from marl_handover.learning.trainer import Trainer
 
     if config.out:
         _require_no_run(Path(config.out))

@@ -70,7 +70,7 @@ class Recorder:
         """Move the bar."""
         if shown:
             self.bar.set_postfix(shown, refresh=False)
-        self.bar.update(step - self.bar.n)
+        self.bar.update(min(step, self.bar.total) - self.bar.n)  # a batch may go beyond the end
 
     def record(self, row: dict[str, float]) -> None:
         """Append one row; values that a run does not have stay empty."""
