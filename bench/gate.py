@@ -455,7 +455,7 @@ def costs(against: str, rounds: int) -> dict[str, Any]:
 def streamed() -> Floats:
     """Joints and fingers (n, 6) of a planned transfer, a row every 60 ms."""
     parked = np.radians(MotionConfig().parked_deg)
-    motion = MotionPlanner(build_cell(cell_config("paper"))).cycle(0, [0.0, 0.0], [30.0, -10.0], parked, parked)
+    motion = MotionPlanner(build_cell(cell_config("paper"))).pick_place(0, [0.0, 0.0], [30.0, -10.0], parked, parked)
     t_s = np.concatenate([phase.t_s for phase in motion.phases])
     columns = [
         *np.concatenate([phase.joints_rad for phase in motion.phases]).T,

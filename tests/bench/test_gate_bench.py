@@ -78,3 +78,16 @@ def test_what_passes_keeps_what_is_promised(court):
 @pytest.mark.slow
 def test_what_passes_keeps_what_is_promised_of_ten_thousand(court):
     check_commands(10_000, 1000, seed=2)
+
+
+def test_a_streamed_transfer_is_timed(tmp_path, monkeypatch, capsys):
+    """As the program that is run at both commits does it."""
+    track = bench.streamed()
+    assert track.shape[1] == 6
+    assert np.degrees(np.abs(np.diff(track[:, :5], axis=0)).max()) <= 20.0
+    assert {0.0, bench.OPEN_MM} <= set(track[:, 5].round(6))
+    np.save(tmp_path / "track.npy", track)
+    monkeypatch.setattr(sys, "argv", ["-c", str(tmp_path / "track.npy")])
+    exec(bench.TIMER, {})
+    median, high = map(float, capsys.readouterr().out.split())
+    assert 0.0 < median <= high
