@@ -32,7 +32,7 @@ class BoardConfig:
     """One controller board."""
 
     port: str = ""  # best a path in /dev/serial/by-id; also any pyserial URL; empty: the only FTDI port there is
-    baud: int = 115200
+    baud: int = bounded(115200, 300, 10**7)
     scan: bool = True  # try the board's other rates when nothing answers
 
 
@@ -52,9 +52,9 @@ class ArmWiring:
     """Where an arm's servos are plugged in. A wrong plug shows at the first move: park with the supply's switch in reach."""
 
     board: str = "main"  # a name in boards
-    channels: list[int] = field(default_factory=lambda: [0, 1, 2, 3, 5])  # of base_yaw, shoulder, elbow, wrist_pitch, wrist_roll
+    channels: list[int] = bounded([0, 1, 2, 3, 5], 0, CHANNELS - 1, (1, 32))  # of base_yaw, shoulder, elbow, wrist_pitch, wrist_roll
     gripper: GripperConfig = field(default_factory=GripperConfig)
-    pulse_limits_us: list[list[int]] = field(default_factory=lambda: [list(PULSE_US) for _ in ARM_JOINTS])  # [lower, upper] of each joint
+    pulse_limits_us: list[list[int]] = bounded([list(PULSE_US) for _ in ARM_JOINTS], *PULSE_US, (1, 32), (2, 2))  # [lower, upper] each
     calibration: str = path_field()  # file of calibrate servos; empty: nominal values, good enough to test directions, not to grasp
 
 

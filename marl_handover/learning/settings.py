@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
@@ -69,6 +70,9 @@ BACKENDS = ("kinematic", "noisy", "bullet")
 EXECUTORS = ("direct", "optimised")
 COLLECTORS = ("local", "multiprocess", "ray")
 
+MOST_BYTES, MOST_WEIGHTS, MOST_ACTIVATIONS = 500 * 10**6, 8 * 10**6, 64 * 10**6
+"""Of a replay memory, of one network, and of one layer's output for one batch; a training takes several times each."""
+
 
 @dataclass
 class TrainConfig:
@@ -125,6 +129,28 @@ class TrainConfig:
             self._validate_decentralised()
         self._validate_source()
         self._refuse_idle()
+        self._refuse_large()
+
+    def _refuse_large(self) -> None:
+        """Raise :class:`InvalidSetting` for settings that are moderate each, and together take more memory than a training needs."""
+        numbers = 30 + (16 * self.centralised.control_points if self.variant == "centralised" else 0)
+        rows = MOST_BYTES // (4 * numbers)
+        if self.replay.capacity > rows:
+            raise InvalidSetting("replay.capacity", self.replay.capacity, f"at most {rows}, which take {MOST_BYTES // 10**6} MB")
+        for key, widths in vars(self.algorithm).items():
+            if not isinstance(widths, list):
+                continue
+            weights = sum(a * b for a, b in itertools.pairwise(widths))
+            if weights > MOST_WEIGHTS:
+                raise InvalidSetting(f"algorithm.{key}", widths, f"smaller: {weights} weights between its layers, at most {MOST_WEIGHTS}")
+            tried = 1 + 2 * getattr(self.algorithm, "candidates", 0)
+            for name, count in (
+                ("algorithm.batch_size", tried * self.algorithm.batch_size),
+                ("evaluation_episodes", self.evaluation_episodes),
+            ):
+                if count * max(widths, default=1) > MOST_ACTIVATIONS:
+                    limit = f"smaller: {count} rows through algorithm.{key} = {widths} are more than {MOST_ACTIVATIONS} numbers"
+                    raise InvalidSetting(name, count, limit)
 
     def _validate_centralised(self) -> None:
         """What that variant cannot do."""

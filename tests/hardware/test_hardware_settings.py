@@ -55,10 +55,10 @@ def test_a_second_board_is_two_settings():
         ("hardware.arms.right.board=other", "hardware.arms.right.board"),
         ("hardware.arms.right.channels=[0,1,2,3,5]", "channels of board main"),
         ("hardware.arms.left.channels=[0,1,2,3]", "hardware.arms.left.channels"),
-        ("hardware.arms.left.channels=[0,1,2,3,32]", "hardware.arms.left.channels"),
+        ("hardware.arms.left.channels=[0,1,2,3,32]", "hardware.arms.left.channels[4]"),
         (
             "hardware.arms.left.pulse_limits_us=[[500,2600],[500,2500],[500,2500],[500,2500],[500,2500]]",
-            "hardware.arms.left.pulse_limits_us",
+            "hardware.arms.left.pulse_limits_us[0][1]",
         ),
         ("hardware.arms.left.gripper.open_us=3000", "hardware.arms.left.gripper.open_us"),
         ("hardware.boards.main.baud=57600", "hardware.boards.main.baud"),
