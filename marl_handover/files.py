@@ -383,7 +383,8 @@ def read_lines(path: Path, limit_bytes: int, what: str, parse: Callable[[bytes],
             except ValueError as error:
                 if line.endswith(b"\n"):
                     raise CorruptFile(what, path, f"line {number} {error}") from error
-                LOG.warning("%s %s was cut off in line %d; the %d lines before it are read", what, path, number, number - 1)
+                if number > 1:  # else nothing is there at all, and whoever reads it says so
+                    LOG.warning("%s %s was cut off in line %d; the %d lines before it are read", what, path, number, number - 1)
                 return
             yield number, parsed
 
