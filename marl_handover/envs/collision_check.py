@@ -47,7 +47,7 @@ class CollisionFinder:
         """Whether the cycle ``paths`` of ``arm`` touches anything, all arms being at ``joints_rad`` (num_arms, 5) before it."""
         if max(float(abs(points[:, 4]).max()) for points in paths) > ROLL_RAD:
             return True
-        planner, other, parked = self._planner, np.delete(joints_rad, arm, 0)[0], self._planner.home_rad
+        planner, other, parked = self._planner, np.delete(joints_rad, arm, 0), self._planner.home_rad
         pick_mm, place_mm = (self._within_reach(arm, paths.transfer[end]) for end in (0, -1))
         segments = (
             planner.reaching(arm, parked, pick_mm, other, leaving=False)[0],

@@ -78,15 +78,19 @@ class MotionPlanner:
             pick_mm: (2,) world position of the pin.
             place_mm: (2,) where it goes.
             joints_rad: (5,) where the arm is now; it ends at its home pose.
-            other_joints_rad: (5,) where the other arm holds still.
+            other_joints_rad: (others, 5) where each other arm holds still, in their order; (5,) where there is one.
 
         Raises:
             OutOfArmsReach, NoPath, NotFinite: why there is no such motion.
         """
         begun = time.perf_counter()
-        pick, place = (self._finite(name, value, 2) for name, value in (("pick_mm", pick_mm), ("place_mm", place_mm)))
+        pick, place = (self._finite(name, value, (2,)) for name, value in (("pick_mm", pick_mm), ("place_mm", place_mm)))
         joints, other = (
-            self._finite(name, value, 5) for name, value in (("joints_rad", joints_rad), ("other_joints_rad", other_joints_rad))
+            self._finite(name, value, size)
+            for name, value, size in (
+                ("joints_rad", joints_rad, (5,)),
+                ("other_joints_rad", other_joints_rad, self._of_others(other_joints_rad)),
+            )
         )
         transfer = self.transfer(arm, pick, place, other)
         approach = self.reach(arm, joints, pick, other, leaving=False)
@@ -102,7 +106,7 @@ class MotionPlanner:
             cell = self.model.cell
             pick, place = cell.bases[0].around((cell.r_min_mm + cell.r_max_mm) / 2, (-0.3, 0.3))
             with suppress(WorkFailed):  # settings under which nothing can move are for the first real command to name
-                self.pick_place(0, pick, place, self.home_rad, self.home_rad)
+                self.pick_place(0, pick, place, self.home_rad, np.tile(self.home_rad, (cell.num_arms - 1, 1)))
 
     def transfer(self, arm: int, pick_mm: Floats, place_mm: Floats, other_joints_rad: Floats) -> FoundPath:
         """The path of the loaded hand from pick to place (world, mm). Raises as :meth:`plan_paths`."""
@@ -172,26 +176,30 @@ class MotionPlanner:
         return self.model.cell.bases[arm].to_local(position_mm)
 
     def _other(self, arm: int, joints_rad: Floats) -> Floats:
-        """Obstacle rows of every other arm, all at the same joints."""
+        """Obstacle rows of every other arm at its joints, (others, 5), or (5,) of the one there is."""
         key = (arm, joints_rad.tobytes())
         if self._standing[0] == key:
             return self._standing[1]
         bases = self.model.cell.bases
         rows = []
-        for index, base in enumerate(bases):
-            if index == arm:
-                continue
+        for index, its_rad in zip(np.delete(np.arange(len(bases)), arm), np.atleast_2d(joints_rad), strict=True):
+            base = bases[index]
             turn = base.facing_rad - bases[arm].facing_rad
             x_mm, y_mm = self.in_base(arm, base.position_mm)
-            rows.append(standing_arm(self.collision_model, self.model.arm, self.motion, joints_rad, float(x_mm), float(y_mm), turn))
+            rows.append(standing_arm(self.collision_model, self.model.arm, self.motion, its_rad, float(x_mm), float(y_mm), turn))
         self._standing = (key, np.concatenate(rows))
         return self._standing[1]
 
+    def _of_others(self, joints_rad: ArrayLike) -> tuple[int, ...]:
+        """The shape of joints of all other arms: that of one vector, if it is one, and one arm's."""
+        others = self.model.cell.num_arms - 1
+        return (5,) if others == 1 and np.ndim(joints_rad) == 1 else (others, 5)
+
     @staticmethod
-    def _finite(name: str, value: ArrayLike, size: int) -> Floats:
+    def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
         array = np.asarray(value, dtype=float)
-        if array.shape != (size,):
-            raise InvalidSetting(name, np.shape(value), f"an array of shape ({size},)")
+        if array.shape != shape:
+            raise InvalidSetting(name, np.shape(value), f"an array of shape {shape}")
         if not np.isfinite(array).all():
             raise NotFinite(name, array.tolist())
         return array

@@ -119,7 +119,8 @@ class Phase:
 
 @dataclass(frozen=True)
 class TransferMotion:
-    """One transfer: ``arm`` takes the block from ``from_mm`` (2,) to ``to_mm`` (2,), the other arm holding still.
+    """One transfer: ``arm`` takes the block from ``from_mm`` (2,) to ``to_mm`` (2,), the others holding still at
+    ``other_joints_rad`` (others, 5), or (5,) where there is one.
 
     ``phases`` are its trajectory, and empty before it is timed.
     """

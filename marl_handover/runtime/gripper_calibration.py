@@ -100,7 +100,7 @@ class GripperCalibration:
         pose = self._block()
         place = max((np.asarray(place[:2]) for place in self.places), key=lambda place: math.dist(place, pose[:2]))
         joints = self.backend.joints_rad()
-        motion = self.planner.plan_paths(arm, pose[:2], place, joints[arm], np.delete(joints, arm, axis=0)[0])
+        motion = self.planner.plan_paths(arm, pose[:2], place, joints[arm], np.delete(joints, arm, axis=0))
         refusal = self.backend.execute(arm, motion.paths).refusal
         return refusal is None
 

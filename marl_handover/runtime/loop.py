@@ -200,7 +200,7 @@ class ClosedLoop:
 
     def _plan(self, order: Order, pose: Floats, seen: Floats) -> TransferMotion:
         joints = self.backend.joints_rad()
-        own, other = self._settled(joints[order.arm]), np.delete(joints, order.arm, axis=0)[0]
+        own, other = self._settled(joints[order.arm]), np.delete(joints, order.arm, axis=0)
         try:
             return self.planner.plan_paths(order.arm, pose[:2], order.place_mm, own, other)
         except OutOfArmsReach:

@@ -69,7 +69,8 @@ def clearances_mm(model: CellModel, settings: MotionConfig, motion: TransferMoti
 
     Over all samples, phase by phase. Fingers count as open.
     """
-    other = _capsules(model, settings, 1 - motion.arm, motion.other_joints_rad, False)
+    standing = zip(np.delete(np.arange(model.cell.num_arms), motion.arm), np.atleast_2d(motion.other_joints_rad), strict=True)
+    other = [shape for arm, joints_rad in standing for shape in _capsules(model, settings, int(arm), joints_rad, False)]
     to_arm, to_table = [], []
     for phase in motion.phases:
         own = _capsules(model, settings, motion.arm, phase.joints_rad, phase.name in LOADED_PHASES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from marl_handover.cell.build import build_cell, cell_config
-from marl_handover.config import MotionConfig
+from marl_handover.config import ArmConfig, CellConfig, MotionConfig
 from marl_handover.errors import InvalidSetting, NotFinite, UnknownChoice
 from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
 from marl_handover.motion.executor import ExecutorAgent
@@ -200,3 +201,23 @@ def test_the_other_shipped_cell_moves_too():
         pick, put = (place(model, 1, *generator.uniform(low, high)) for _ in range(2))
         motion = planner.pick_place(1, pick, put, planner.home_rad, planner.home_rad)
         assert motion.min_clearance_mm >= planner.motion.arm_clearance_mm
+
+
+def test_each_other_arm_is_avoided_where_it_stands():
+    """With three arms: rows of obstacles are those of the two others, each at its own joints; one vector for both is refused."""
+    places = [(0.0, 207.8, -90.0), (-180.0, -103.9, 30.0), (180.0, -103.9, 150.0)]
+    arms = [ArmConfig(f"arm{k}", *place) for k, place in enumerate(places)]
+    three = MotionPlanner(build_cell(replace(CellConfig(grid_mm=10.0), arms=arms)))
+    reaching = np.array([0.2, 1.2, -2.2, 1.0, 0.0])
+    base = three.model.cell.bases[0]
+    pick, place = base.around(180.0, np.array([-0.9, 0.9]))
+    home, one = np.tile(three.home_rad, (2, 1)), np.stack([reaching, three.home_rad])
+    alone, with_one = (three.carrying(0, pick, place, joints)[0].scene.obstacles for joints in (home, one))
+    assert len(alone) == len(with_one) == 2 * len(three.collision_model.capsules)
+    half = len(alone) // 2
+    np.testing.assert_array_equal(alone[half:], with_one[half:])
+    assert abs(alone[:half] - with_one[:half]).max() > 10.0
+    motion = three.pick_place(0, pick, place, three.home_rad, home)
+    assert motion.min_clearance_mm >= three.motion.arm_clearance_mm
+    with pytest.raises(InvalidSetting, match=r"other_joints_rad = \(5,\): must be an array of shape \(2, 5\)"):
+        three.pick_place(0, pick, place, three.home_rad, three.home_rad)
