@@ -17,10 +17,12 @@ LONGEST_VALUE, LONGEST_LIST, LONGEST_REASON = 120, 160, 220
 """Characters of a value, of a list of choices and of a reason in a message."""
 
 
-def shortened(text: str, longest: int = LONGEST_VALUE) -> str:
-    """``text``, its middle left out if it is longer than ``longest``: both ends tell most."""
+def shortened(text: str, longest: int = LONGEST_VALUE, keep_end: bool = True) -> str:
+    """``text``, its middle left out if it is longer than ``longest``: both ends of a value tell most. Of a sentence the beginning does."""
     if len(text) <= longest:
         return text
+    if not keep_end:
+        return f"{text[: longest - 4]} ..."
     head = (longest - 5) * 2 // 3
     return f"{text[:head]} ... {text[len(text) - (longest - 5 - head) :]}"
 
@@ -83,7 +85,7 @@ class BadOverride(HandoverError):
     """A ``key=value`` argument that cannot be read."""
 
     def __init__(self, text: str, reason: str) -> None:
-        super().__init__(f"cannot read {shown(text)}: {shortened(reason, LONGEST_REASON)}")
+        super().__init__(f"cannot read {shown(text)}: {shortened(reason, LONGEST_REASON, keep_end=False)}")
         self.text, self.reason = text, reason
 
 
@@ -99,7 +101,7 @@ class CorruptFile(HandoverError):
     """A file is there but cannot be read as what it should be."""
 
     def __init__(self, what: str, path: Path | str, reason: str) -> None:
-        super().__init__(f"{what} {shortened(str(path), LONGEST_LIST)} cannot be read: {shortened(reason, LONGEST_REASON)}")
+        super().__init__(f"{what} {shortened(str(path), LONGEST_LIST)} cannot be read: {shortened(reason, LONGEST_REASON, keep_end=False)}")
         self.what, self.path, self.reason = what, Path(path), reason
 
 

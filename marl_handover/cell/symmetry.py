@@ -108,7 +108,7 @@ def symmetries(arms: Sequence[Arm], spaces: Mapping[tuple[int, int], SharedSpace
     for image in range(len(arms)):
         for handed in (1.0, -1.0):
             # An isometry is known by what it makes of one frame, and whether it reflects.
-            R = _axes(arms[image]) @ np.diag([1.0, handed]) @ _axes(arms[0]).T
+            R = arms[image].base.rotation() @ np.diag([1.0, handed]) @ arms[0].base.rotation().T
             shift = arms[image].base.position_mm - R @ arms[0].base.position_mm
             permutation = [_image(arm, arms, R, shift, handed) for arm in arms]
             if None not in permutation and len(set(permutation)) == len(arms):
@@ -120,7 +120,7 @@ def _symmetry(R: np.ndarray, shift: np.ndarray, arms: tuple[int, ...], spaces: M
     signs = {}
     for (i, j), space in spaces.items():
         image = spaces[(min(arms[i], arms[j]), max(arms[i], arms[j]))]
-        one, other = (_turn(part.frame.facing) for part in (space, image))
+        one, other = space.frame.rotation(), image.frame.rotation()
         signs[(i, j)] = tuple(round(float(other[:, axis] @ R @ one[:, axis])) for axis in range(2))
     return Symmetry(_exact(R), (float(round(shift[0], 9)) + 0.0, float(round(shift[1], 9)) + 0.0), arms, signs)  # type: ignore[arg-type]
 
@@ -130,22 +130,12 @@ def _image(arm: Arm, arms: Sequence[Arm], R: np.ndarray, shift: np.ndarray, hand
     low, high = sorted(handed * value for value in arm.yaw_rad)
     for index, other in enumerate(arms):
         there = np.linalg.norm(R @ arm.base.position_mm + shift - other.base.position_mm) < _SAME_MM
-        faces = np.linalg.norm(R @ np.array(arm.base.facing) - np.array(other.base.facing)) < _SAME_RAD
+        faces = np.linalg.norm(R @ arm.base.rotation()[:, 0] - other.base.rotation()[:, 0]) < _SAME_RAD
         reach = max(abs(arm.r_min_mm - other.r_min_mm), abs(arm.r_max_mm - other.r_max_mm)) < _SAME_MM
         turns = max(abs(low - other.yaw_rad[0]), abs(high - other.yaw_rad[1])) < _SAME_RAD
         if there and faces and reach and turns and arm.robot == other.robot:
             return index
     return None
-
-
-def _axes(arm: Arm) -> np.ndarray:
-    """The axes of an arm's base frame as columns."""
-    return _turn(arm.base.facing)
-
-
-def _turn(facing: tuple[float, float]) -> np.ndarray:
-    x, y = facing
-    return np.array([[x, -y], [y, x]])
 
 
 def _exact(R: np.ndarray) -> Matrix:

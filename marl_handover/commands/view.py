@@ -21,6 +21,7 @@ from marl_handover.config import (
     chosen,
     path_field,
     require_between,
+    require_choice,
     seed_field,
 )
 from marl_handover.errors import InvalidSetting, MissingFile
@@ -116,6 +117,7 @@ def mode_of(config: ViewCommand) -> str:
     if len(given) > 1:
         raise InvalidSetting("live", config.live, "left out with trace=FILE: a page shows one of them")
     mode = config.mode or (given[0] if given else "play")
+    require_choice("mode", mode, MODES)
     if given and mode != given[0]:
         raise InvalidSetting("mode", mode, f"{given[0]}, or left out, with {given[0]}=...")
     if mode != "play" and not given:

@@ -58,7 +58,7 @@ class CentralisedRules(Rules):
 
     def decode(self, action: Array) -> MotionCommand:
         """Command of an action (..., 4 + M)."""
-        command = super().decode(action)
+        command = super().decode(action[..., : Rules.action_size])
         return MotionCommand(*command, namespace(action).clip(action[..., Rules.action_size :], -1.0, 1.0))
 
     def transfer(self, pose: Array, goal: Array, command: Command) -> tuple[Array, Array]:

@@ -40,6 +40,11 @@ class SE2:
         """The origin (2,) in the world."""
         return np.array([self.x_mm, self.y_mm])
 
+    def rotation(self) -> Floats:
+        """The frame's axes in the world as columns (2, 2); exact where the direction is."""
+        cos, sin = self.facing
+        return np.array([[cos, -sin], [sin, cos]])
+
     def to_world(self, points_mm: ArrayLike) -> Floats:
         """Points (..., 2) or (..., 3) of this frame in the world; heights stay."""
         points = np.array(points_mm, dtype=float)

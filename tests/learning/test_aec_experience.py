@@ -227,9 +227,8 @@ def test_a_run_learns_from_it_stops_and_goes_on(small, tmp_path, table):
     ],
 )
 def test_what_cannot_be_is_refused_by_name(settings, name):
-    config = compose(train.SCHEMA, settings, groups=train.GROUPS, aliases=train.ALIASES)
     with pytest.raises(HandoverError, match=f"^{name} = "):
-        config.validate()
+        compose(train.SCHEMA, settings, groups=train.GROUPS, aliases=train.ALIASES).validate()
 
 
 def test_noisy_arms_are_judged_by_what_is_measured(begin):

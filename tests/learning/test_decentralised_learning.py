@@ -317,9 +317,8 @@ def test_only_transfers_count_as_steps(small, tmp_path):
     ],
 )
 def test_what_cannot_be_is_refused_by_name(small, setting, named):
-    config = small("sac", "variant=decentralised", "decentralised.learners=independent", setting)
     with pytest.raises(InvalidSetting, match=named):
-        config.validate()
+        small("sac", "variant=decentralised", "decentralised.learners=independent", setting).validate()
 
 
 def test_passing_for_ever_never_pays_and_one_pass_is_cheaper_than_a_transfer():

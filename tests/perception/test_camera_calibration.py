@@ -70,7 +70,7 @@ def test_a_file_comes_back_as_it_was_and_keeps_the_one_before(tmp_path):
         ({"format": "a poem"}, "no calibration"),
         ({"matrix_px": [[1, 0], [0, 1]]}, "matrix_px"),
         ({"matrix_px": [[-917, 0, 0], [0, 917, 0], [0, 0, 1]]}, "focal"),
-        ({"distortion": [0, 0, 0, 0, float("nan")]}, "distortion"),
+        ({"distortion": [0, 0, 0, 0, float("nan")]}, "NaN"),
         ({"T_camera_world": np.diag([2.0, 1, 1, 1]).tolist()}, "rigid"),
         ({"T_camera_world": np.diag([-1.0, 1, 1, 1]).tolist()}, "rigid"),
         ({"size_px": None}, ".bak"),

@@ -75,7 +75,7 @@ def test_the_realsense_library_is_asked_for_by_its_install_line(monkeypatch, tmp
     for text in ("raise ImportError('libusb-1.0.so.0: cannot open shared object file')", "raise OSError('no driver')"):
         (tmp_path / "pyrealsense2.py").write_text(text)
         monkeypatch.syspath_prepend(str(tmp_path))
-        with pytest.raises(NoCamera, match=r"pip install .*\[realsense\].*libusb"):
+        with pytest.raises(NoCamera, match=r"pip install .*pyrealsense2.*libusb"):
             open_camera(CameraConfig("realsense"))
 
 
