@@ -367,13 +367,14 @@ def read_lines(path: Path, limit_bytes: int, what: str, parse: Callable[[bytes],
     """The lines of a file that grows, each with its number from 1; empty ones are left out.
 
     A last line without an end that ``parse`` cannot read was cut off, by a full disk or a killed process: it is left out, and a warning
-    says so.
+    says so. Where it would be the only one, the file is none.
 
     ``parse`` makes something of a line, or raises :class:`ValueError`. The others are as of :func:`open_bounded`, and its errors.
 
     Raises:
         CorruptFile: ``parse`` cannot read another line.
     """
+    some = False
     with open_bounded(path, limit_bytes, what) as stream:
         for number, line in enumerate(stream, start=1):
             if not line.strip():
@@ -381,11 +382,12 @@ def read_lines(path: Path, limit_bytes: int, what: str, parse: Callable[[bytes],
             try:
                 parsed = parse(line)
             except ValueError as error:
-                if line.endswith(b"\n"):
+                if line.endswith(b"\n") or not some:
                     raise CorruptFile(what, path, f"line {number} {error}") from error
                 if number > 1:  # else nothing is there at all, and whoever reads it says so
                     LOG.warning("%s %s was cut off in line %d; the %d lines before it are read", what, path, number, number - 1)
                 return
+            some = True
             yield number, parsed
 
 

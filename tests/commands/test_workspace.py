@@ -67,4 +67,4 @@ def test_bad_input_is_one_line(tmp_path, capsys, monkeypatch, argument, said):
 def test_a_folder_that_cannot_be(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert cli.main(["workspace", f"out={tmp_path}/file"]) == 2
-    assert "can be written" in capsys.readouterr().err
+    assert f"{tmp_path}/file cannot be written" in capsys.readouterr().err
