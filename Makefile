@@ -18,7 +18,7 @@ help:
 	@echo "make fuzz       20,000 random command lines over every key of every command, in one process (an hour or two)"
 	@echo "make test-lowest the tests with the lowest versions that pyproject.toml allows, in .venv-lowest"
 	@echo "make check      style, types and import layers; make format repairs the style"
-	@echo "make bench      measure motion planning, speed, and learning against Stable-Baselines3 (hours)"
+	@echo "make bench      measure motion planning, the safety gate, speed, and learning against Stable-Baselines3 (hours)"
 	@echo "make docs       build the documentation site into site/; warnings are errors"
 	@echo "make pretrained train the three policies that are shipped"
 	@echo "make wheel      build a wheel into dist/"
@@ -68,6 +68,7 @@ format: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,peers,ompl]"
 	$(BIN)/python bench/motion.py
+	$(BIN)/python bench/gate.py commands=10000
 	$(BIN)/python bench/run.py
 
 docs: $(STAMP)

@@ -428,7 +428,9 @@ print(*np.percentile(costs, [50, 95]))
 def costs(against: str, rounds: int) -> dict[str, Any]:
     """Median and p95 in us of one streamed command checked, here and at the commit, the least of ``rounds`` in turn; and their ratio."""
     with tempfile.TemporaryDirectory() as folder:
-        packed = subprocess.run(["git", "archive", against, "marl_handover", "urdf", "configs"], cwd=ROOT, capture_output=True, check=True)
+        packed = subprocess.run(["git", "archive", against, "marl_handover", "urdf", "configs"], cwd=ROOT, capture_output=True, check=False)
+        if packed.returncode:
+            sys.exit(f"gate.py: cannot use against={against!r}: {packed.stderr.decode().strip()}")
         subprocess.run(["tar", "x", "-C", folder], input=packed.stdout, check=True)
         track = Path(folder) / "track.npy"
         np.save(track, streamed())
