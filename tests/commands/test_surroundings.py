@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import os
+import re
+import stat
 import subprocess
 import sys
+import tempfile
 from dataclasses import fields
+from pathlib import Path
 
 import matplotlib
 import pytest
 from matplotlib.figure import Figure
 
+import marl_handover
 from marl_handover import cli, progress
 from marl_handover.commands import calibrate, compare, evaluate, plan, run, simulate, train, tune, view
+from marl_handover.files import cache_folder
 from marl_handover.report.files import save_figure
 
 
@@ -67,3 +73,23 @@ def test_without_progress_nothing_is_shown(capsys, monkeypatch):
                 pass
         said = capsys.readouterr().err
         assert ("bar" in said) == ("counting" in said) == shown
+
+
+def test_an_account_without_a_home_keeps_its_caches_among_temporary_files_of_its_own(tmp_path, monkeypatch):
+    def no_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", no_home)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = cache_folder()
+    assert (folder.parent, stat.S_IMODE(folder.stat().st_mode)) == (tmp_path, 0o700)
+    assert cache_folder() == folder
+    folder.chmod(0o777)  # a stranger could put tables there
+    assert cache_folder() != folder
+
+
+def test_nobody_else_asks_for_the_home_folder():
+    package = Path(marl_handover.__file__).parent
+    found = {str(path.relative_to(package)) for path in package.rglob("*.py") if re.search(r"Path\.home\(|expanduser\(", path.read_text())}
+    assert found == {"files.py"}
