@@ -225,7 +225,7 @@ def test_the_papers_method_by_name(tmp_path, capsys):
 def test_a_transfer_without_a_motion_is_one_line_and_nothing_is_written(tmp_path, capsys):
     """A block so wide that it hits the arm that holds it."""
     names = {"motion": "m.json", "motion_picture": "m.png", "json": "p.json", "picture": "p.png"}
-    assert cli.main(["plan", "cell.block.side_mm=250", *(f"{key}={tmp_path / name}" for key, name in names.items())]) == 1
+    assert cli.main(["plan", "cell.block.side_mm=200", *(f"{key}={tmp_path / name}" for key, name in names.items())]) == 1
     assert capsys.readouterr().err.startswith("marl-handover plan: transfer 1, arm R, has no motion: the start pose is ")
     assert list(tmp_path.iterdir()) == []
 
