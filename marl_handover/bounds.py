@@ -197,7 +197,7 @@ def _check_text(name: str, value: str, bounds: Bounds) -> None:
         raise InvalidSetting(name, value, f"at most {bounds.longest} characters; this has {len(value)}")
     if bounds.is_name and (_NO_NAME.search(value) or value in (".", "..")):
         raise InvalidSetting(name, value, "a name of letters, digits and . _ - + only, which folders and files are called after")
-    if any(character < " " or character == "\x7f" for character in value):
+    if any(character < " " or "\x7f" <= character <= "\x9f" for character in value):
         raise InvalidSetting(name, value, "text without control characters")
 
 

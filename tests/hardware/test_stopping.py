@@ -170,6 +170,7 @@ def test_real_and_simulated_arms_stop_without_each_other(armed, tmp_path, monkey
     monkeypatch.setattr(latches, "user_path", lambda suffix: tmp_path / f"user{suffix}")
     real = armed()
     simulated = armed()  # its boards take the place of the first ones' names; ports that are open stay
+    simulated.driver.latch.leave()
     simulated.driver.latch = PrivateStop()
     real.clock.at(real.clock.now_s() + 0.3, lambda: StopLatch(real.latch.path).latch("real arms"))
     with pytest.raises(Stopped, match="real arms"):
