@@ -48,14 +48,14 @@ class Stepped(NamedTuple):
     """What a decision did within an episode, each (...).
 
     ``result``; ``transfers`` made so far; ``truncated``: none is left, without a verdict; ``outcome``: that of the result, or a time-out;
-    ``idle``: no arm was to move.
+    ``idle``: no arm was to move; None where that may not be.
     """
 
     result: Transition
     transfers: Array
     truncated: Array
     outcome: Array
-    idle: Array
+    idle: Array | None
 
     @property
     def over(self) -> Array:
@@ -86,7 +86,7 @@ def advance(
     result = rules.step(
         pose, goal, previous_arm, action, transfers_left=left, epsilon_rad=epsilon_rad, noise=noise, final_noise=final_noise
     )
-    total, idle = made + result.transfers, result.terminated & ~result.terminated
+    total, idle = made + result.transfers, None
     if may_wait:
         idle = nobody_moves(action) & (result.external_arm < 0)
         result, total = _without(result, idle), xp.where(idle, limit, total)
