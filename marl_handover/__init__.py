@@ -4,11 +4,10 @@ With the package imported, Gymnasium knows ``marl_handover/SupervisorA-v0`` and 
 imported for that: ``marl-handover stop`` must not wait for it.
 """
 
-import importlib.abc
-import importlib.machinery
 import importlib.util
 import sys
 from collections.abc import Sequence
+from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 __version__ = "0.1.0"
@@ -23,12 +22,10 @@ def _register(gymnasium: ModuleType) -> None:
         )
 
 
-class _Registrar(importlib.abc.MetaPathFinder):
+class _Registrar:
     """Waits for the first import of Gymnasium, and registers what is ours once it is there."""
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> importlib.machinery.ModuleSpec | None:
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Nothing is found here; Gymnasium's own loader is told to go on with us."""
         if fullname != "gymnasium":
             return None

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from marl_handover.errors import BadOverride, HandoverError, exit_status_of, shortened, shown
-from marl_handover.progress import working
 
 PROGRAM = "marl-handover"
 LONGEST_LINE = 300
@@ -125,10 +124,11 @@ def _output_lost() -> bool:
 def _dispatch(name: str, arguments: list[str]) -> int:
     command = COMMANDS[name]
     begun = (importlib.import_module(command.first).at_once(arguments),) if command.first else ()
+    from marl_handover.progress import showing, working  # after that: a stop waits for nothing
+
     with working("loading the libraries", logged=False):
         module: Any = importlib.import_module(command.module)
     from marl_handover.compose import compose, keys_help
-    from marl_handover.progress import showing
 
     if any(argument in ("--help", "-h") for argument in arguments):
         print(f"usage: {PROGRAM} {name} [key=value ...]\n\n{command.summary}\n\n{keys_help(module.SCHEMA, module.ALIASES, module.GROUPS)}")

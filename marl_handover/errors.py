@@ -11,8 +11,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from marl_handover.requirements import install_line
-
 LONGEST_VALUE, LONGEST_LIST, LONGEST_REASON = 120, 160, 220
 """Characters of a value, of a list of choices and of a reason in a message."""
 
@@ -213,6 +211,8 @@ class MissingExtra(HandoverError):
     """A setting needs a package that is not installed."""
 
     def __init__(self, setting: str, package: str, extra: str) -> None:
+        from marl_handover.requirements import install_line  # here: a stop needs errors, and must not wait for package metadata
+
         super().__init__(f"{setting} needs the package {package}; run: {install_line(extra)}")
         self.setting, self.package, self.extra = setting, package, extra
 

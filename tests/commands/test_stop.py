@@ -116,7 +116,7 @@ put = latch._put
 def noted(path, text):
     put(path, text)
     used = resource.getrusage(resource.RUSAGE_SELF)
-    heavy = {"numpy", "hydra", "omegaconf", "numba", "gymnasium", "torch", "scipy"} & set(sys.modules)
+    heavy = {"numpy", "hydra", "omegaconf", "numba", "gymnasium", "torch", "scipy", "tqdm", "importlib.metadata"} & set(sys.modules)
     print("latched after", used.ru_utime + used.ru_stime, *sorted(heavy))
 latch._put = noted
 from marl_handover.cli import main
