@@ -18,7 +18,7 @@ import yaml
 from marl_handover.errors import CorruptFile
 from marl_handover.files import MEGABYTE, read_bounded, read_lines
 
-DEPTH, DIGITS, NODES = 50, 40, 100_000
+DEPTH, DIGITS, NODES = 50, 20, 100_000
 """How deep lists and mappings may nest, how many digits a whole number may have, how many values a YAML file may unfold to."""
 JSON_BYTES, YAML_BYTES, LINES_BYTES = 64 * MEGABYTE, MEGABYTE, 1000 * MEGABYTE
 """Largest sizes: of a JSON file, of a YAML file, of a file of JSON Lines."""
