@@ -36,6 +36,14 @@ def _sign_up_here(tmp_path_factory):
         yield
 
 
+@pytest.fixture
+def alone(tmp_path, monkeypatch):
+    """No session of another test in this process is on the roll: what a page stops is then the session that the test made up."""
+    from marl_handover.hardware import roll
+
+    monkeypatch.setattr(roll, "user_path", lambda suffix: tmp_path / f"user{suffix}")
+
+
 @pytest.fixture(scope="session")
 def paper() -> Cell:
     return load_cell("paper")

@@ -21,6 +21,8 @@ from marl_handover.perception.overlay import jpeg
 from marl_handover.runtime.feed import EVENTS_FILE, FORMAT, PICTURE_FILE, SILENT_S, STATE_FILE, VERSION, Feed, NotSteerable
 from marl_handover.runtime.steering import ControlFolder
 
+pytestmark = pytest.mark.usefixtures("alone")
+
 
 def state(**fields):
     usual = {

@@ -23,6 +23,8 @@ from marl_handover.viewer import live_words
 from marl_handover.viewer.live import LivePage, _picking
 from marl_handover.viewer.scene import CellScene
 
+pytestmark = pytest.mark.usefixtures("alone")
+
 
 @pytest.fixture(scope="module")
 def session(twin_calibration, tmp_path_factory):
