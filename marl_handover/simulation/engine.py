@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Never
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.errors import HandoverError, WorkFailed
+from marl_handover.errors import HandoverError, UrdfError, WorkFailed
 
 
 @contextmanager
@@ -182,16 +182,19 @@ class Engine:
         self._connection()
 
     def load_arm(self, path: Path, x_mm: float, y_mm: float, yaw_rad: float) -> int:
-        """A URDF with its base fixed to the table; gives the body's number."""
-        body = pybullet.loadURDF(
-            str(path),
-            basePosition=[length(x_mm), length(y_mm), 0.0],
-            baseOrientation=pybullet.getQuaternionFromEuler([0.0, 0.0, yaw_rad]),
-            useFixedBase=True,
-            globalScaling=SCALE,
-            flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_SELF_COLLISION,
-            physicsClientId=self.client,
-        )
+        """A URDF with its base fixed to the table; gives the body's number. Raises :class:`UrdfError` for one that PyBullet cannot load."""
+        try:
+            body = pybullet.loadURDF(
+                str(path),
+                basePosition=[length(x_mm), length(y_mm), 0.0],
+                baseOrientation=pybullet.getQuaternionFromEuler([0.0, 0.0, yaw_rad]),
+                useFixedBase=True,
+                globalScaling=SCALE,
+                flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_SELF_COLLISION,
+                physicsClientId=self.client,
+            )
+        except pybullet.error as error:
+            raise UrdfError(path, "PyBullet cannot load it; every mesh it names has to be there, as .obj, .stl or .dae") from error
         for link in range(pybullet.getNumJoints(body, physicsClientId=self.client)):
             # globalScaling leaves inertias as the file has them.
             inertia = pybullet.getDynamicsInfo(body, link, physicsClientId=self.client)[2]

@@ -26,6 +26,7 @@ FILES = {
     "huge.urdf": URDF.replace("0.106", "1e300"),
     "far.urdf": URDF.replace("0.106", "1000"),
     "links.urdf": URDF.replace("</robot>", "".join(f'<link name="x{i}"/>' for i in range(2000)) + "</robot>"),
+    "mesh.urdf": URDF.replace("<visual>", "<visual><geometry><mesh filename='/etc/passwd'/></geometry></visual><visual>", 1),
     "still.urdf": re.sub(r'velocity="[^"]*"', 'velocity="0"', URDF),
 }
 TUNE = ["tune", "algorithm=td3", "trials=1", "jobs=1", "out=t", "steps=64", "compile=off", "progress=false"]
@@ -68,6 +69,7 @@ LINES = [
     (["calibrate", "what=sheets", "hardware=twin", "calibration=c", "cards.ids=[[1,2],[3]]"], "cards.ids"),
     (["calibrate", "what=sheets", "hardware=twin", "calibration=c", "target.goal_mm=1e9"], "target.goal_mm"),
     (["simulate", "cell.block.pin_diameter_mm=-1"], "cell.block.pin_diameter_mm"),
+    (["simulate", "cell.urdf=mesh.urdf", "seed=1", "progress=false"], "every mesh it names"),
     (["workspace", "out=~no-such-user-here/x"], "no such home"),
 ]
 
