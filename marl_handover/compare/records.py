@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import platform
 import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -131,19 +129,6 @@ def commits_of(record: Mapping[str, Any]) -> list[str]:
 def write_record(path: Path, content: Mapping[str, Any]) -> None:
     """Write such a file as a whole."""
     write_whole(path, json.dumps(content, indent=1) + "\n")
-
-
-def machine() -> dict[str, Any]:
-    """What numbers were made on."""
-    import torch
-
-    model = platform.processor()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model)
-    except OSError:
-        pass
-    return {"cpu": model, "cores": os.cpu_count(), "platform": platform.platform(), "torch": torch.__version__}
 
 
 def commit() -> str:

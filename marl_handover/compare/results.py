@@ -17,7 +17,7 @@ from marl_handover.compare import statistics
 from marl_handover.compare.records import REPORT_KEYS, TRAINED_KEYS, commits_of, fingerprint, read_record, settings_of
 from marl_handover.compare.runs import RUN_FOLDER, TRAINED, Task
 from marl_handover.compare.suite import RowSpec, Suite
-from marl_handover.compare.suite_check import BAR_MEASURES
+from marl_handover.compare.suite_check import BAR_MEASURES, REPORTED
 from marl_handover.errors import HandoverError
 from marl_handover.report.metrics import Metrics, common_curve, read_metrics
 from marl_handover.task.rules import Outcome
@@ -148,7 +148,7 @@ def _evaluation(row: Tree, name: str) -> Tree:
     found: Tree = {"runs": len(reports), "true_coverage": statistics.true_coverage(len(reports))}
     found |= {"episodes": sum(report["episodes"] for report in reports), "backend": reports[0]["backend"]}
     found["outcomes"] = {key: sum(report["outcomes"][key] for report in reports) for key in _endings()}
-    columns = {measure: np.array(scores) for measure in BAR_MEASURES if (scores := measure_scores(row, name, measure))}
+    columns = {measure: np.array(scores) for measure in (*BAR_MEASURES, *REPORTED) if (scores := measure_scores(row, name, measure))}
     for runs in sorted({len(scores) for scores in columns.values()}):
         # One bootstrap for all measures that the same number of runs have: it is what takes time here.
         measures = [measure for measure, scores in columns.items() if len(scores) == runs]

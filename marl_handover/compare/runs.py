@@ -20,6 +20,7 @@ from marl_handover.compare import records, suite_check
 from marl_handover.compare.records import fingerprint, read_record, settings_of, write_record
 from marl_handover.errors import HandoverError, WorkFailed
 from marl_handover.files import expanded
+from marl_handover.learning.recorder import machine
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.locks import held
 from marl_handover.runtime.assessment import AssessmentConfig
@@ -187,7 +188,7 @@ def execute(task: Task) -> bool:
 
 def _do(task: Task) -> None:
     task.folder.mkdir(parents=True, exist_ok=True)
-    here = {"commit": task.commit, "machine": records.machine()}
+    here = {"commit": task.commit, "machine": machine()}
     if task.train is not None and read_record(task.folder / TRAINED, records.TRAINED_KEYS) is None:
         _train(task, task.train, here)
     failed = []
@@ -221,7 +222,7 @@ def _train(task: Task, config: TrainConfig, here: Mapping[str, Any]) -> None:
     if (folder / FILE).is_file():
         trainer.restore()
     summary = trainer.run()
-    kept = {key: summary[key] for key in ("step", "gradient_step", "episodes", "wall_s", "best_step")}
+    kept = {key: summary[key] for key in ("step", "gradient_step", "episodes", "wall_s", "best_step", "selection", "compile_state")}
     write_record(task.folder / TRAINED, {**asked, **kept})
 
 

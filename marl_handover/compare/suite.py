@@ -71,7 +71,7 @@ class TableSpec:
     """One table, as Markdown and CSV."""
 
     name: str = ""
-    kind: str = ""  # evaluation, milestones, runs, comparison
+    kind: str = ""  # evaluation, milestones, runs, comparison, range
     title: str = ""
     rows: list[str] = field(default_factory=list)
     evaluations: list[str] = field(default_factory=list)  # as of figures

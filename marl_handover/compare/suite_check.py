@@ -18,10 +18,12 @@ RUN = "{run}"
 """Stands for a trained row's run directory in the name of a policy."""
 
 CURVE_MEASURES = ("success_rate", "mean_steps", "steps_ratio", "training_success_rate", "training_mean_length")
+REPORTED = ("mean_steps",)
+"""Measured besides, and not to be drawn as bars: mean steps mix in what failed, so that a policy that fails at once looks quick."""
+
 BAR_MEASURES = (
     "success_rate",
     "success_in_the_end",
-    "mean_steps",
     "mean_steps_success",
     "steps_ratio",
     "path_mm",
@@ -42,6 +44,7 @@ TABLES = {
     "milestones": ("rows",),
     "runs": ("rows",),
     "comparison": ("evaluations", "pairs"),
+    "range": ("rows", "evaluations"),
 }
 """The same of tables."""
 

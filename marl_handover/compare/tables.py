@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -53,6 +54,7 @@ def make_tables(results: Tree) -> list[Table]:
         "milestones": _milestones,
         "runs": _runs,
         "comparison": _comparison,
+        "range": _range,
     }
     tables = [Table(spec["name"], spec["title"] or spec["name"], *makers[spec["kind"]](results, spec)) for spec in results["tables"]]
     return [table for table in tables if table.rows]
@@ -128,7 +130,7 @@ def _evaluation(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell
         _interval_column("success, %", "success_rate"),
         *([_interval_column("in the end, %", "success_in_the_end")] if in_the_end else []),
         Column("mean, %", ("success_rate_mean",)),
-        _interval_column("mean steps", "mean_steps"),
+        _interval_column("mean steps, failed ones too", "mean_steps"),
         *(Column(title, (name, f"{name}_low", f"{name}_high", f"{name}_runs")) for name, title, _ in SOLVED),
         *(_interval_column(title, name) for name, title in PATHS if spec["paths"]),
     ]
@@ -190,6 +192,39 @@ def _runs(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
         sizes = (_text(len(done)), _plain(row["settings"]["steps"]), _plain(gradient_steps), _text(best), _plain(minutes, "{:.1f}"))
         rows.append([_text(row["label"]), Cell(f"`{arguments}`", (arguments,)), *sizes, _text(commits)])
     return [Column(title) for title in titles], rows
+
+
+RANGED = (("success_rate", "success, %", "{:.2f}", 100.0, min), ("steps_ratio", "steps ÷ optimum (solved)", "{:.3f}", 1.0, max))
+"""Measures of the table of ranges: name, heading, form, scale, which end is the worst."""
+
+
+def _range(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
+    """What a run may bring: the worst, the median and the best of the runs, each measure for itself."""
+    labels = {item["name"]: item["label"] or item["name"] for item in results["evaluations"]}
+    ends = ("worst", "median", "best")
+    columns = [Column("row"), Column("evaluation"), Column("seeds"), Column("problems a run")]
+    columns += [Column(f"{title}: {' / '.join(ends)}", tuple(f"{name}_{end}" for end in ends)) for name, title, *_ in RANGED]
+    columns += [Column("seconds a run: median", ("wall_s",)), Column("processor")]
+    rows = []
+    for name in spec["evaluations"] or list(labels):
+        for row in (row for row in _wanted(results, spec["rows"]) if name in row["evaluations"]):
+            runs = [run for run in row["runs"] if name in run["evaluations"]]
+            reports = [run["evaluations"][name] for run in runs]
+            cells = [_text(row["label"]), _text(labels[name]), _text(len(runs)), _plain(reports[0]["episodes"])]
+            cells += [_ends([report[key] for report in reports], form, scale, worst) for key, _, form, scale, worst in RANGED]
+            seconds = [run["trained"]["wall_s"] for run in runs if run["trained"]]
+            cells.append(_plain(statistics.median(seconds) if seconds else None))
+            rows.append([*cells, _text(", ".join(dict.fromkeys(report["machine"]["cpu"] for report in reports)))])
+    return columns, rows
+
+
+def _ends(values: Sequence[float | None], form: str, scale: float, worst: Callable[[Sequence[float]], float]) -> Cell:
+    """Worst, median and best of a measure that every run has; without that, nothing can be said of the worst."""
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return Cell(NONE, (None, None, None))
+    found = (worst(known), statistics.median(known), max(known) if worst is min else min(known))
+    return Cell(" / ".join(form.format(scale * value) for value in found), found)
 
 
 def _comparison(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:

@@ -95,6 +95,13 @@ class Algorithm(ABC):
             part.load_state_dict(state[name])
 
 
+def stepped(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+    """One step of an optimiser down a loss."""
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+
+
 def compiled(function: Callable[..., Any], mode: str) -> Callable[..., Any]:
     """``function`` compiled, or itself.
 
@@ -114,6 +121,16 @@ def compiled(function: Callable[..., Any], mode: str) -> Callable[..., Any]:
         return function
     torch.compiler.reset()
     return _Compiled(function, torch.compile(function, dynamic=False), falls_back=mode == "auto")
+
+
+def compile_state(owner: object) -> str:
+    """What the functions that ``owner`` has from :func:`compiled` run as, or would: ``compiled``, ``failed`` or ``plain``."""
+    parts = [part for value in vars(owner).values() for part in (value if isinstance(value, list) else [value])]
+    functions = [part for value in parts for part in (value if isinstance(value, tuple) else [value])]
+    tried = [function for function in functions if isinstance(function, _Compiled)]
+    if any(function.chosen is function.plain for function in tried):
+        return "failed"
+    return "compiled" if tried else "plain"
 
 
 class _Compiled:

@@ -43,9 +43,10 @@ class SacConfig(OffPolicyConfig):
     """Hybrid SAC: exact expectation over (arm, final, place mode), tanh-Gaussian places, two temperatures."""
 
     name: str = "sac"
-    actor_hidden: list[int] = bounded([128, 128], 1, 4096, (0, 8))
+    actor_hidden: list[int] = bounded([256, 256], 1, 4096, (0, 8))  # places are harder to say than to judge
     critic_hidden: list[int] = bounded([128, 128], 1, 4096, (0, 8))
     final_hidden: list[int] = bounded([64, 64], 1, 4096, (0, 8))  # of the critic of finishing
+    actor_tau: float = bounded(0.005, 0.0, 1.0)  # smoothing of the actor that is judged and kept; 1: none
     modes: int = bounded(1, 1, 64)  # place distributions an arm, chosen between like the other discrete branches
     canonical: bool = True  # fold the mirror symmetry M_x into the networks
     harmonics: int = bounded(2, 0, 16)  # doublings of the angles that the networks see

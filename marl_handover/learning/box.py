@@ -1,7 +1,8 @@
-"""The paper's view of the action: all four numbers in one box. SAC and TD3 with TorchRL's own losses."""
+"""The paper's view of the action: all four numbers in one box. SAC and TD3."""
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import torch
@@ -9,15 +10,18 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded
-from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import SACLoss, SoftUpdate, TD3Loss
+from torchrl.modules import ValueOperator
+from torchrl.objectives import SoftUpdate, TD3Loss
 
-from marl_handover.learning.algorithm import Algorithm
-from marl_handover.learning.algorithm_settings import BoxSacConfig, OffPolicyConfig, Td3Config
-from marl_handover.learning.networks import mlp
+from marl_handover.learning.algorithm import Algorithm, compiled, stepped
+from marl_handover.learning.algorithm_settings import BoxSacConfig, Td3Config
+from marl_handover.learning.networks import Branches, TwinMLP, mlp, squashed_sample
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.task.observations import observation_size
 from marl_handover.task.rules import Rules
+
+BOX_LOG_STD_RANGE = (-20.0, 2.0)
+"""As Stable-Baselines3 has it."""
 
 
 class StateActionValue(nn.Module):
@@ -32,94 +36,110 @@ class StateActionValue(nn.Module):
         return self.net(torch.cat([observation, action], -1))
 
 
-class BoxAlgorithm(Algorithm):
-    """Shared parts: TorchRL modules, Adam, scaled rewards, target update."""
+class BoxSacLoss(nn.Module):
+    """The losses of SAC on one squashed Gaussian of all numbers, with both values in one batched product.
+
+    Args:
+        net: observations (n, size) -> (n, 2 * actions): means, then logarithms of deviations.
+        value: observation and action (n, size + actions) -> (2, n).
+        config: the algorithm's settings.
+    """
+
+    def __init__(self, net: nn.Sequential, value: TwinMLP, config: BoxSacConfig) -> None:
+        super().__init__()
+        self.net, self.value, self.config = net, value, config
+        self.target = copy.deepcopy(value).requires_grad_(False)
+        self.log_temperature = nn.Parameter(torch.zeros(()))
+
+    def drawn(self, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions (n, actions) of standard normal ``noise``, and their log-densities (n,)."""
+        mean, log_std = self.net(observation).float().chunk(2, -1)
+        return squashed_sample(Branches(mean, mean, log_std.clamp(*BOX_LOG_STD_RANGE)), noise)
+
+    def value_loss(self, observation: Tensor, action: Tensor, reward: Tensor, terminated: Tensor, after: Tensor, noise: Tensor) -> Tensor:
+        """Squared error of both values, summed over the two; ``reward`` and ``terminated`` (n,)."""
+        with torch.no_grad():
+            following, log_prob = self.drawn(after, noise)
+            future = self.target(torch.cat([after, following], -1)).amin(0) - self.log_temperature.exp() * log_prob
+            target = self.config.reward_scale * reward + self.config.gamma * torch.where(terminated, 0.0, future)
+        return (self.value(torch.cat([observation, action], -1)) - target).square().mean(1).sum()
+
+    def actor_loss(self, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Loss of the actor, and the mean entropy of its actions, for the temperature."""
+        action, log_prob = self.drawn(observation, noise)
+        value = self.value(torch.cat([observation, action], -1)).amin(0)
+        return (self.log_temperature.detach().exp() * log_prob - value).mean(), -log_prob.mean().detach()
+
+
+class BoxSac(Algorithm):
+    """SAC as the paper used it, with the usual target entropy: minus the number of numbers."""
 
     kind = "box"
-    config: OffPolicyConfig
-    net: nn.Sequential
-
-    def _finish(self, loss: Any, actor_parameters: list[nn.Parameter], value_parameters: list[nn.Parameter]) -> None:
-        self.loss = loss.to(self.device)
-        self.loss.make_value_estimator(gamma=self.config.gamma)
-        self.target = SoftUpdate(self.loss, tau=self.config.tau)
-        rate = self.config.learning_rate
-        self.actor_optimizer = torch.optim.Adam(actor_parameters, lr=rate, fused=True)
-        self.value_optimizer = torch.optim.Adam(value_parameters, lr=rate, fused=True)
-
-    def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
-        """Loss module (actor, values, targets) and optimisers."""
-        return {"loss": self.loss, "actor_optimizer": self.actor_optimizer, "value_optimizer": self.value_optimizer}
-
-    def actor(self) -> nn.Module:
-        """The network from observation to action parameters; its first outputs are the mean before the tanh."""
-        return self.net
-
-    @torch.no_grad()
-    def act(self, observation: Tensor) -> Tensor:
-        """The mean action."""
-        return self.net(observation)[..., : self.rules.action_size].tanh()
-
-    def _scaled(self, batch: TensorDictBase) -> TensorDictBase:
-        """The batch with rewards times ``reward_scale``."""
-        batch = batch.clone(recurse=False)
-        batch["next"] = batch["next"].clone(recurse=False)
-        batch["next", "reward"] = batch["next", "reward"] * self.config.reward_scale
-        return batch
-
-
-class BoxSac(BoxAlgorithm):
-    """SAC as the paper used it."""
-
     config: BoxSacConfig
 
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
         super().__init__(rules, config, generator)
-        inputs = observation_size(rules.config.layout)
-        self.net = mlp(inputs, self.config.hidden, 2 * rules.action_size).to(self.device)
-        self.policy = gaussian_policy(self.net, rules.action_size, self.device)
-        network = StateActionValue(inputs, self.config.hidden, rules.action_size).to(self.device)
-        value = ValueOperator(network, in_keys=["observation", "action"])
-        spec = box_spec(rules.action_size, self.device)
-        loss = SACLoss(self.policy, value, num_qvalue_nets=2, loss_function="l2", action_spec=spec)
-        self._finish(
-            loss, list(loss.actor_network_params.flatten_keys().values()), list(loss.qvalue_network_params.flatten_keys().values())
-        )
-        self.temperature_optimizer = torch.optim.Adam([self.loss.log_alpha], lr=self.config.learning_rate)
+        inputs, size, hidden = observation_size(rules.config.layout), rules.action_size, self.config.hidden
+        value = TwinMLP(inputs + size, hidden, normalised=False)
+        self.loss = BoxSacLoss(mlp(inputs, hidden, 2 * size), value, self.config).to(self.device)
+        rate = self.config.learning_rate
+        self.actor_optimizer = torch.optim.Adam(self.loss.net.parameters(), lr=rate, fused=True)
+        self.value_optimizer = torch.optim.Adam(self.loss.value.parameters(), lr=rate, fused=True)
+        self.temperature_optimizer = torch.optim.Adam([self.loss.log_temperature], lr=rate)
+        self._value_loss = compiled(self.loss.value_loss, config.compile)
+        self._actor_loss = compiled(self.loss.actor_loss, config.compile)
+
+    def actor(self) -> nn.Module:
+        """The network from observation to action parameters; its first outputs are the mean before the tanh."""
+        return self.loss.net
 
     def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
-        """As the base class, and the temperature's optimiser."""
-        return {**super().modules(), "temperature_optimizer": self.temperature_optimizer}
+        """The loss module holds all networks and the temperature."""
+        return {
+            "loss": self.loss,
+            "actor_optimizer": self.actor_optimizer,
+            "value_optimizer": self.value_optimizer,
+            "temperature_optimizer": self.temperature_optimizer,
+        }
 
     @torch.no_grad()
     def explore(self, observation: Tensor) -> Tensor:
         """An action drawn from the policy."""
-        loc, raw_scale = self.net(observation).chunk(2, -1)
-        scale = NormalParamExtractor()(torch.cat([loc, raw_scale], -1))[1]
-        noise = torch.randn(loc.shape, generator=self.generator, device=self.device)
-        return (loc + scale * noise).tanh()
+        return self.loss.drawn(observation, self._noise(len(observation)))[0]
+
+    @torch.no_grad()
+    def act(self, observation: Tensor) -> Tensor:
+        """The mean action."""
+        return self.loss.net(observation)[..., : self.rules.action_size].tanh()
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """One step of all three losses."""
-        optimizers = (self.actor_optimizer, self.value_optimizer, self.temperature_optimizer)
-        losses = self.loss(self._scaled(batch))
-        for optimizer in optimizers:
-            optimizer.zero_grad()
-        (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
-        for optimizer in optimizers:
-            optimizer.step()
-        self.target.step()
+        """One step of the values, the actor, the temperature and the target."""
+        seen, following = batch["observation"], batch["next"]
+        earned = following["reward"][:, 0], following["terminated"][:, 0]
+        value_loss = self._value_loss(seen, batch["action"], *earned, following["observation"], self._noise(len(batch)))
+        stepped(self.value_optimizer, value_loss)
+        self.loss.value.requires_grad_(False)
+        actor_loss, entropy = self._actor_loss(seen, self._noise(len(batch)))
+        stepped(self.actor_optimizer, actor_loss)
+        self.loss.value.requires_grad_(True)
+        stepped(self.temperature_optimizer, self.loss.log_temperature * (entropy + self.rules.action_size))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.loss.target.parameters()), list(self.loss.value.parameters()), self.config.tau)
         return {
-            "loss_critic": losses["loss_qvalue"].detach(),
-            "loss_actor": losses["loss_actor"].detach(),
-            "temperature_place": losses["alpha"].detach(),
-            "entropy_place": losses["entropy"].detach(),
+            "loss_critic": value_loss.detach(),
+            "loss_actor": actor_loss.detach(),
+            "temperature_place": self.loss.log_temperature.detach().exp(),
+            "entropy_place": entropy,
         }
 
+    def _noise(self, count: int) -> Tensor:
+        return torch.randn(count, self.rules.action_size, generator=self.generator, device=self.device)
 
-class Td3(BoxAlgorithm):
-    """TD3: deterministic policy, delayed, with smoothed targets."""
 
+class Td3(Algorithm):
+    """TD3: deterministic policy, delayed, with smoothed targets; TorchRL's own loss."""
+
+    kind = "box"
     config: Td3Config
 
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
@@ -131,10 +151,26 @@ class Td3(BoxAlgorithm):
         value = ValueOperator(network, in_keys=["observation", "action"])
         spec = box_spec(rules.action_size, self.device)
         loss = TD3Loss(policy, value, num_qvalue_nets=2, loss_function="l2", action_spec=spec, policy_noise=self.config.target_noise)
-        self._finish(
-            loss, list(loss.actor_network_params.flatten_keys().values()), list(loss.qvalue_network_params.flatten_keys().values())
-        )
+        self.loss = loss.to(self.device)
+        self.loss.make_value_estimator(gamma=self.config.gamma)
+        self.target = SoftUpdate(self.loss, tau=self.config.tau)
+        rate = self.config.learning_rate
+        self.actor_optimizer = torch.optim.Adam(list(loss.actor_network_params.flatten_keys().values()), lr=rate, fused=True)
+        self.value_optimizer = torch.optim.Adam(list(loss.qvalue_network_params.flatten_keys().values()), lr=rate, fused=True)
         self.updates = 0
+
+    def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
+        """Loss module (actor, values, targets) and optimisers."""
+        return {"loss": self.loss, "actor_optimizer": self.actor_optimizer, "value_optimizer": self.value_optimizer}
+
+    def actor(self) -> nn.Module:
+        """The network from observation to action before the tanh."""
+        return self.net
+
+    @torch.no_grad()
+    def act(self, observation: Tensor) -> Tensor:
+        """The policy's action."""
+        return self.net(observation).tanh()
 
     def state_dict(self) -> dict[str, Any]:
         """As the base class, and the count that delays the policy."""
@@ -156,7 +192,10 @@ class Td3(BoxAlgorithm):
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """One step of the critics; every ``policy_delay``-th also of the policy and the targets."""
-        losses: TensorDict = self.loss(self._scaled(batch))
+        batch = batch.clone(recurse=False)
+        batch["next"] = batch["next"].clone(recurse=False)
+        batch["next", "reward"] = batch["next", "reward"] * self.config.reward_scale
+        losses: TensorDict = self.loss(batch)
         self.value_optimizer.zero_grad()
         self.actor_optimizer.zero_grad()
         (losses["loss_qvalue"] + losses["loss_actor"]).backward()
@@ -166,13 +205,6 @@ class Td3(BoxAlgorithm):
             self.actor_optimizer.step()
             self.target.step()
         return {"loss_critic": losses["loss_qvalue"].detach(), "loss_actor": losses["loss_actor"].detach()}
-
-
-def gaussian_policy(net: nn.Module, actions: int, device: torch.device) -> ProbabilisticActor:
-    """Tanh-Gaussian policy of a network (n, size) -> (n, 2 * actions): means, then raw scales."""
-    parameters = TensorDictModule(nn.Sequential(net, NormalParamExtractor()), in_keys=["observation"], out_keys=["loc", "scale"])
-    spec = box_spec(actions, device)
-    return ProbabilisticActor(parameters, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True, spec=spec)
 
 
 def box_spec(actions: int, device: torch.device) -> Bounded:

@@ -17,11 +17,11 @@ from torchrl.objectives.common import LossModule
 
 from marl_handover.config import CentralisedConfig
 from marl_handover.envs.centralised import CentralisedRules
-from marl_handover.learning.algorithm import Algorithm, compiled
+from marl_handover.learning.algorithm import Algorithm, compiled, stepped
 from marl_handover.learning.algorithm_settings import SacConfig
 from marl_handover.learning.box import BoxSac
 from marl_handover.learning.centralised_networks import MotionActor, MotionCritic
-from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, unpacked
+from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, averaging, unpacked
 from marl_handover.learning.networks import arm_blocks, chosen_action, squashed_sample
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.motion.transfer_features import mirrored_numbers
@@ -36,6 +36,7 @@ class Drawn(NamedTuple):
     branch_entropy: Tensor
     place_log_prob: Tensor
     motion_log_prob: Tensor
+    mean: Tensor  # of places, in (-1, 1)
 
 
 class CentralisedSacLoss(HybridSacLoss):
@@ -79,7 +80,7 @@ class CentralisedSacLoss(HybridSacLoss):
             - temperature[0] * (probability[..., 1:] * place_log_prob).sum((-2, -1))
             + temperature[1] * branch_entropy
         )
-        return Drawn(soft, probability, branch_entropy, place_log_prob, motion_log_prob)
+        return Drawn(soft, probability, branch_entropy, place_log_prob, motion_log_prob, branches.mean.tanh())
 
     def _ways(self, observation: Tensor, place: Tensor) -> Tensor:
         """Features (n, arms, 1 + modes, fields) of the ways of all branches, final ones first."""
@@ -123,7 +124,7 @@ class CentralisedSacLoss(HybridSacLoss):
         loss = -drawn.value.mean()
         if candidates.numel():
             some = {key: value[: len(candidates)] for key, value in batch.items()}
-            loss = loss + self.config.candidate_weight * self._candidate_loss(some, candidates, offsets)
+            loss = loss + self.config.candidate_weight * self._candidate_loss(some, drawn.mean[: len(candidates)], candidates, offsets)
         return loss, drawn.branch_entropy.mean().detach(), place_entropy.detach(), motion_entropy.detach()
 
     def _place_value(self, batch: dict[str, Tensor], places: Tensor) -> Tensor:
@@ -172,6 +173,7 @@ class CentralisedSac(HybridSac):
         self.actor_optimizer = torch.optim.Adam(actor.parameters(), **adam)
         self.critic_optimizer = torch.optim.Adam(critic.parameters(), **adam)
         self.temperature_optimizer = torch.optim.Adam([self.loss.log_temperatures], lr=own.temperature_rate)
+        self.average = averaging(self.trained())
         self._critic_loss = compiled(self.loss.critic_loss, config.compile)
         self._actor_loss = compiled(self.loss.motion_actor_loss, config.compile)
         self.targets = self._targets(0.0)
@@ -189,8 +191,13 @@ class CentralisedSac(HybridSac):
 
     def exported(self) -> list[list[nn.Linear]]:
         """The layers of the network that decides and of the one that moves."""
-        networks = (self.loss.actor.net, self.loss.actor.move)
+        actor = self._kept()
+        networks = (actor.net, actor.move)
         return [[module for module in network.modules() if isinstance(module, nn.Linear)] for network in networks]
+
+    def _kept(self) -> MotionActor:
+        assert isinstance(self.average, MotionActor)
+        return self.average
 
     def about(self) -> dict[str, Any]:
         """How the actor reads its blocks, and what its motions mean."""
@@ -207,25 +214,26 @@ class CentralisedSac(HybridSac):
     @torch.no_grad()
     def act(self, observation: Tensor) -> Tensor:
         """The likeliest branch, its mean place and the mean motion there."""
-        branches = self.loss.actor(observation)
+        branches = self.average(observation)
         decision = chosen_action(branches.logits, branches.mean.tanh())
-        return self.loss.actor.with_motion(observation, decision, decision.new_zeros(len(decision), self.count))
+        return self._kept().with_motion(observation, decision, decision.new_zeros(len(decision), self.count))
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """One step of the critics, the actor, the temperatures and the target."""
         present, following = with_actions(batch)
         shape = (len(batch), self.loss.noise_width)
         critic_loss = self._critic_loss(present, following, self._noise(shape))
-        self._step(self.critic_optimizer, critic_loss)
+        stepped(self.critic_optimizer, critic_loss)
         tried = (int(len(batch) * self.config.candidate_share), self.rules.cell.num_arms, self.config.candidates, 2)
         self.loss.critic.requires_grad_(False)
         actor_loss, branch, place, motion = self._actor_loss(present, self._noise(shape), self._anywhere(tried), self._nearby(tried))
-        self._step(self.actor_optimizer, actor_loss)
+        stepped(self.actor_optimizer, actor_loss)
         self.loss.critic.requires_grad_(True)
         targets = torch.tensor([*self.targets, self.motion_target], device=self.device)
-        self._step(self.temperature_optimizer, self.loss.temperature_losses(torch.stack([place, branch, motion]), targets))
+        stepped(self.temperature_optimizer, self.loss.temperature_losses(torch.stack([place, branch, motion]), targets))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.loss.target.parameters()), list(self.loss.critic.parameters()), self.config.tau)
+            self._average()
         temperatures = self.loss.log_temperatures.detach().exp()
         return {
             "loss_critic": critic_loss.detach(),

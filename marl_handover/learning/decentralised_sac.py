@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 from marl_handover.cell import NO_ARM
 from marl_handover.envs.decentralised import TurnRules
-from marl_handover.learning.algorithm import Algorithm, compiled
+from marl_handover.learning.algorithm import Algorithm, compiled, stepped
 from marl_handover.learning.algorithm_settings import SacConfig
-from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, SoftValue
+from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, SoftValue, averaging
 from marl_handover.learning.networks import Branches, arm_blocks, squashed_sample
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.turn_networks import PASS, PLACE, TurnActor, TurnCritic, turn_action
@@ -33,11 +33,12 @@ OWN = len(ARM_FIELDS)
 
 
 class BranchValues(NamedTuple):
-    """Of each branch (n, 2 + modes): log-probability and value, a place's with its entropy; and ``place_log_prob`` (n, modes)."""
+    """Of each branch (n, 2 + modes): log-probability and value, a place's with its entropy; and ``place_log_prob`` (n, modes), ``mean``."""
 
     log_probability: Tensor
     value: Tensor
     place_log_prob: Tensor
+    mean: Tensor  # (n, 1, modes, 2), of places, in (-1, 1)
 
 
 class TurnSacLoss(HybridSacLoss):
@@ -75,15 +76,15 @@ class TurnSacLoss(HybridSacLoss):
         final_value = critic.value_final(batch["observation"]).amin(0)
         pass_value = critic.value_place(batch["blocks"], torch.ones_like(final_value)).amin(0)
         value = torch.cat([torch.stack([final_value, pass_value], -1), place_value[:, 0]], -1)
-        return BranchValues(branches.logits[:, 0].log_softmax(-1), value, place_log_prob[:, 0])
+        return BranchValues(branches.logits[:, 0].log_softmax(-1), value, place_log_prob[:, 0], branches.mean.tanh())
 
     def soft_value(self, critic: TurnCritic, batch: dict[str, Tensor], noise: Tensor) -> SoftValue:  # type: ignore[override]
         """Soft value of the present policy on its turn; ``probability`` (n, 2 + modes) and ``place_log_prob`` (n, modes) have no arms."""
-        log_probability, value, place_log_prob = self.branch_values(critic, batch, noise)
+        log_probability, value, place_log_prob, mean = self.branch_values(critic, batch, noise)
         probability = log_probability.exp()
         branch_entropy = -(probability * log_probability).sum(-1)
         total = (probability * value).sum(-1) + self.log_temperatures.detach()[1].exp() * branch_entropy
-        return SoftValue(total, probability, branch_entropy, place_log_prob)
+        return SoftValue(total, probability, branch_entropy, place_log_prob, mean)
 
     def actor_loss(self, batch: dict[str, Tensor], noise: Tensor, candidates: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As the base class; besides, a branch that is clearly better than the policy is made likelier, however unlikely it is.
@@ -91,7 +92,7 @@ class TurnSacLoss(HybridSacLoss):
         The gradient of an expected value vanishes with the probability of a branch, and passing, the safest choice of a beginner, would
         stay the only one long after the critic knows better.
         """
-        log_probability, value, place_log_prob = self.branch_values(self.critic, batch, noise)
+        log_probability, value, place_log_prob, mean = self.branch_values(self.critic, batch, noise)
         probability, temperature = log_probability.exp(), self.log_temperatures.detach().exp()[1]
         expected, branch_entropy = (probability * value).sum(-1), -(probability * log_probability).sum(-1)
         best, branch = value.detach().max(-1)
@@ -100,7 +101,7 @@ class TurnSacLoss(HybridSacLoss):
         loss = -(expected + temperature * branch_entropy).mean() - missed
         if candidates.numel():
             some = {key: tensor[: len(candidates)] for key, tensor in batch.items()}
-            loss = loss + self.config.candidate_weight * self._candidate_loss(some, candidates, offsets)
+            loss = loss + self.config.candidate_weight * self._candidate_loss(some, mean[: len(candidates)], candidates, offsets)
         weight = probability[:, PLACE:].detach()
         place_entropy = -(weight * place_log_prob).sum() / weight.sum().clamp_min(1e-6)
         return loss, branch_entropy.mean().detach(), place_entropy.detach()
@@ -172,6 +173,7 @@ class DecentralisedSac(HybridSac):
         parts = [loss for loss in self.losses if isinstance(loss, TurnSacLoss)]
         adam: dict[str, Any] = {"lr": self.config.learning_rate, "fused": True}
         self.actors = nn.ModuleList([loss.actor for loss in parts])
+        self.average = averaging(self.actors)
         self.critics = nn.ModuleList([loss.critic for loss in parts])
         self.actor_optimizer = torch.optim.Adam(self.actors.parameters(), **adam)
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), **adam)
@@ -186,13 +188,13 @@ class DecentralisedSac(HybridSac):
         target.load_state_dict(critic.state_dict())
         return TurnSacLoss(rules, actor, critic, target.requires_grad_(False), own)
 
-    def actor(self) -> nn.Module:
+    def trained(self) -> nn.Module:
         """The policy network, or the arms' two."""
         return self.actors
 
     def exported(self) -> list[list[nn.Linear]]:
         """The layers of each actor."""
-        return [[module for module in actor.modules() if isinstance(module, nn.Linear)] for actor in self.actors]
+        return [[module for module in actor.modules() if isinstance(module, nn.Linear)] for actor in self.average.children()]
 
     def about(self) -> dict[str, Any]:
         """As the base class, and what kind of learners."""
@@ -202,14 +204,15 @@ class DecentralisedSac(HybridSac):
         """The losses hold all networks and the temperatures."""
         return {
             "losses": self.losses,
+            "average": self.average,
             "actor_optimizer": self.actor_optimizer,
             "critic_optimizer": self.critic_optimizer,
             "temperature_optimizer": self.temperature_optimizer,
         }
 
-    def _branches(self, observation: Tensor) -> Branches:
-        """What the arms whose turn it is say of :func:`~marl_handover.envs.decentralised.own_view` (n, VIEW_SIZE)."""
-        said = [actor(observation[:, :OWN]) for actor in self.actors]
+    def _branches(self, actors: nn.Module, observation: Tensor) -> Branches:
+        """What the arms whose turn it is say, by ``actors``, of :func:`~marl_handover.envs.decentralised.own_view` (n, VIEW_SIZE)."""
+        said = [actor(observation[:, :OWN]) for actor in actors.children()]
         right = observation[:, OWN] > 0
         left, other = said[0], said[-1]
         return Branches(*(torch.where(right.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(left, other, strict=True)))
@@ -220,7 +223,7 @@ class DecentralisedSac(HybridSac):
 
         Policies that know little find waiting safest, and the memory would fill with episodes in which nothing happens.
         """
-        branches = self._branches(observation)
+        branches = self._branches(self.actors, observation)
         # Some cells follow the deterministic policy: where that goes in circles, its states must get into the memory.
         curious = torch.arange(len(observation), device=self.device) >= int(self.config.greedy_share * len(observation))
         needed = (observation[:, REACHES] > 0) & (observation[:, OWN + 1] > 0)
@@ -236,7 +239,7 @@ class DecentralisedSac(HybridSac):
     @torch.no_grad()
     def act(self, observation: Tensor) -> Tensor:
         """The likeliest branch and its mean place."""
-        branches = self._branches(observation)
+        branches = self._branches(self.average, observation)
         return turn_action(branches.logits, branches.mean.tanh())
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -247,7 +250,7 @@ class DecentralisedSac(HybridSac):
         shape = (count, 1, self.config.modes, 2)
         critic = [lossy(*both, self._noise(shape)) for (_, lossy, _), both in zip(self.parts, rows, strict=True)]
         critic_loss = torch.stack(critic).sum()
-        self._step(self.critic_optimizer, critic_loss)
+        stepped(self.critic_optimizer, critic_loss)
         tried = (int(count * self.config.candidate_share), 1, self.config.candidates, 2)
         self.critics.requires_grad_(False)
         acted = [
@@ -255,13 +258,14 @@ class DecentralisedSac(HybridSac):
             for (_, _, lossy), (present, _) in zip(self.parts, rows, strict=True)
         ]
         actor_loss = torch.stack([loss for loss, _, _ in acted]).sum()
-        self._step(self.actor_optimizer, actor_loss)
+        stepped(self.actor_optimizer, actor_loss)
         self.critics.requires_grad_(True)
         heat = [part[0].temperature_loss(branch, place, self.targets) for part, (_, branch, place) in zip(self.parts, acted, strict=True)]
-        self._step(self.temperature_optimizer, torch.stack(heat).sum())
+        stepped(self.temperature_optimizer, torch.stack(heat).sum())
         with torch.no_grad():
             for loss, _, _ in self.parts:
                 torch._foreach_lerp_(list(loss.target.parameters()), list(loss.critic.parameters()), self.config.tau)
+            self._average()
         return self._logged(critic_loss, actor_loss, acted)
 
     def _logged(self, critic_loss: Tensor, actor_loss: Tensor, acted: list[tuple[Tensor, ...]]) -> dict[str, Tensor]:

@@ -8,6 +8,7 @@ leave some states in a poor local optimum, and a deterministic policy then cycle
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
-from marl_handover.learning.algorithm import Algorithm, compiled
+from marl_handover.learning.algorithm import Algorithm, compiled, stepped
 from marl_handover.learning.algorithm_settings import SacConfig
 from marl_handover.learning.networks import AfterstateCritic, HybridActor, arm_blocks, chosen_action, squashed_sample
 from marl_handover.learning.settings import TrainConfig
@@ -34,6 +35,7 @@ class SoftValue(NamedTuple):
     probability: Tensor  # (n, arms, 1 + modes)
     branch_entropy: Tensor  # (n,)
     place_log_prob: Tensor  # (n, arms, modes)
+    mean: Tensor  # (n, arms, modes, 2), in (-1, 1)
 
 
 class HybridSacLoss(LossModule):
@@ -85,7 +87,7 @@ class HybridSacLoss(LossModule):
             + (probability[..., 0] * final_value).sum(-1)
             + temperature[1] * branch_entropy
         )
-        return SoftValue(value, probability, branch_entropy, place_log_prob)
+        return SoftValue(value, probability, branch_entropy, place_log_prob, branches.mean.tanh())
 
     def critic_loss(self, batch: dict[str, Tensor], following: dict[str, Tensor], noise: Tensor) -> Tensor:
         """Squared error of both critics on the branch that was taken, summed over the two."""
@@ -109,16 +111,16 @@ class HybridSacLoss(LossModule):
         loss = -soft.value.mean()
         if candidates.numel():
             some = {key: value[: len(candidates)] for key, value in batch.items()}
-            loss = loss + self.config.candidate_weight * self._candidate_loss(some, candidates, offsets)
+            loss = loss + self.config.candidate_weight * self._candidate_loss(some, soft.mean[: len(candidates)], candidates, offsets)
         return loss, soft.branch_entropy.mean().detach(), place_entropy.detach()
 
-    def _candidate_loss(self, batch: dict[str, Tensor], candidates: Tensor, offsets: Tensor) -> Tensor:
+    def _candidate_loss(self, batch: dict[str, Tensor], mean: Tensor, candidates: Tensor, offsets: Tensor) -> Tensor:
         """Squared distance of each arm's best mode to the *nearest* of some places that beat it by the margin.
 
         The nearest, not the best: between two equally good regions, drawing towards now one, now the other would leave the
-        mean in the bad middle. The places are ``candidates`` (n, arms, m, 2) and the mean itself moved by ``offsets`` (n, arms, k, 2).
+        mean in the bad middle. The places are ``candidates`` (n, arms, m, 2), and the ``mean`` (n, arms, modes, 2) moved by ``offsets``
+        (n, arms, k, 2).
         """
-        mean = self.actor(batch["observation"]).mean.tanh()
         modes = mean.shape[2]
         with torch.no_grad():
             mode_value, mode = self._place_value(batch, mean).max(-1)
@@ -150,6 +152,11 @@ class HybridSacLoss(LossModule):
         critic = self.critic_loss(batch, following, noise[0])
         actor, branch, place = self.actor_loss(batch, noise[1], none, none)
         return TensorDict({"loss_qvalue": critic, "loss_actor": actor, "entropy_branch": branch, "entropy_place": place})
+
+
+def averaging(module: nn.Module) -> nn.Module:
+    """A copy to hold the average of a module that is trained; without gradients."""
+    return copy.deepcopy(module).requires_grad_(False)
 
 
 def unpacked(batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -194,6 +201,7 @@ class HybridSac(Algorithm):
         self.actor_optimizer = torch.optim.Adam(actor.parameters(), **adam)
         self.critic_optimizer = torch.optim.Adam(critic.parameters(), **adam)
         self.temperature_optimizer = torch.optim.Adam([self.loss.log_temperatures], lr=own.temperature_rate)
+        self.average = averaging(self.trained())
         self._critic_loss = compiled(self.loss.critic_loss, config.compile)
         self._actor_loss = compiled(self.loss.actor_loss, config.compile)
         self.targets = self._targets(0.0)
@@ -212,18 +220,23 @@ class HybridSac(Algorithm):
             group["lr"] = self.config.temperature_rate
         self.targets = self._targets(fraction)
 
-    def actor(self) -> nn.Module:
-        """The policy network."""
+    def trained(self) -> nn.Module:
+        """The policy network that is trained, and explores."""
         return self.loss.actor
+
+    def actor(self) -> nn.Module:
+        """The policy network that is judged and kept: an average over the last steps. After a single one it is good here and bad there."""
+        return self.average
 
     def about(self) -> dict[str, Any]:
         """How the actor reads its blocks."""
         return {key: getattr(self.config, key) for key in ("modes", "canonical", "harmonics")}
 
     def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
-        """The loss module holds all networks and the temperatures."""
+        """The loss module holds all networks that are trained, and the temperatures."""
         return {
             "loss": self.loss,
+            "average": self.average,
             "actor_optimizer": self.actor_optimizer,
             "critic_optimizer": self.critic_optimizer,
             "temperature_optimizer": self.temperature_optimizer,
@@ -246,7 +259,7 @@ class HybridSac(Algorithm):
     @torch.no_grad()
     def act(self, observation: Tensor) -> Tensor:
         """The likeliest branch and its mean place."""
-        branches = self.loss.actor(observation)
+        branches = self.average(observation)
         return chosen_action(branches.logits, branches.mean.tanh())
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -254,17 +267,18 @@ class HybridSac(Algorithm):
         present, following = unpacked(batch)
         shape = (len(batch), self.rules.cell.num_arms, self.config.modes, 2)
         critic_loss = self._critic_loss(present, following, self._noise(shape))
-        self._step(self.critic_optimizer, critic_loss)
+        stepped(self.critic_optimizer, critic_loss)
         tried = (int(shape[0] * self.config.candidate_share), shape[1], self.config.candidates, 2)
         self.loss.critic.requires_grad_(False)
         actor_loss, branch_entropy, place_entropy = self._actor_loss(
             present, self._noise(shape), self._anywhere(tried), self._nearby(tried)
         )
-        self._step(self.actor_optimizer, actor_loss)
+        stepped(self.actor_optimizer, actor_loss)
         self.loss.critic.requires_grad_(True)
-        self._step(self.temperature_optimizer, self.loss.temperature_loss(branch_entropy, place_entropy, self.targets))
+        stepped(self.temperature_optimizer, self.loss.temperature_loss(branch_entropy, place_entropy, self.targets))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.loss.target.parameters()), list(self.loss.critic.parameters()), self.config.tau)
+            self._average()
         return {
             "loss_critic": critic_loss.detach(),
             "loss_actor": actor_loss.detach(),
@@ -274,11 +288,9 @@ class HybridSac(Algorithm):
             "temperature_branch": self.loss.log_temperatures.detach()[1].exp(),
         }
 
-    @staticmethod
-    def _step(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+    def _average(self) -> None:
+        """Let the average follow the trained actor by a step."""
+        torch._foreach_lerp_(list(self.average.parameters()), list(self.trained().parameters()), self.config.actor_tau)
 
     def _anywhere(self, shape: tuple[int, ...]) -> Tensor:
         """Chart coordinates spread evenly, with a share exactly on the edge, where the largest turns are made."""

@@ -27,10 +27,11 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
 
 
 class TwinMLP(nn.Module):
-    """Two scalar networks of one shape with layer norm, evaluated in one batched product: (n, inputs) -> (2, n)."""
+    """Two scalar networks of one shape, evaluated in one batched product: (n, inputs) -> (2, n); with layer norm if ``normalised``."""
 
-    def __init__(self, inputs: int, hidden: Sequence[int]) -> None:
+    def __init__(self, inputs: int, hidden: Sequence[int], normalised: bool = True) -> None:
         super().__init__()
+        self.normalised = normalised
         widths = [inputs, *hidden, 1]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for fan_in, fan_out in pairwise(widths):
@@ -45,7 +46,7 @@ class TwinMLP(nn.Module):
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = torch.baddbmm(bias, x, weight)
             if index < last:
-                x = F.relu(F.layer_norm(x, (x.shape[-1],)))
+                x = F.relu(F.layer_norm(x, (x.shape[-1],)) if self.normalised else x)
         return x[..., 0]
 
 

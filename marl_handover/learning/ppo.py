@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.modules import NormalParamExtractor, ValueOperator
+from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from marl_handover.learning.algorithm import Algorithm
 from marl_handover.learning.algorithm_settings import PpoConfig
-from marl_handover.learning.box import gaussian_policy
+from marl_handover.learning.box import box_spec
 from marl_handover.learning.networks import mlp
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.task.observations import observation_size
@@ -80,3 +81,10 @@ class Ppo(Algorithm):
                 nn.utils.clip_grad_norm_(self.loss.parameters(), self.config.max_grad_norm)
                 self.optimizer.step()
         return {"loss_critic": losses["loss_critic"].detach(), "loss_actor": losses["loss_objective"].detach()}
+
+
+def gaussian_policy(net: nn.Module, actions: int, device: torch.device) -> ProbabilisticActor:
+    """Tanh-Gaussian policy of a network (n, size) -> (n, 2 * actions): means, then raw scales."""
+    parameters = TensorDictModule(nn.Sequential(net, NormalParamExtractor()), in_keys=["observation"], out_keys=["loc", "scale"])
+    spec = box_spec(actions, device)
+    return ProbabilisticActor(parameters, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True, spec=spec)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import math
 import os
+import platform
 import socket
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from marl_handover.errors import Diverged
@@ -37,6 +39,17 @@ COLUMNS = (
     "temperature_place",
     "temperature_branch",
 )
+
+
+def machine() -> dict[str, Any]:
+    """What numbers were made on. Runs of one seed differ by the processor: sums are rounded in its order."""
+    model = platform.processor()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model)
+    except OSError:
+        pass
+    return {"cpu": model, "cores": os.cpu_count(), "platform": platform.platform(), "torch": torch.__version__}
 
 
 class Recorder:

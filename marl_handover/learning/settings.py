@@ -91,7 +91,7 @@ class TrainConfig:
     executor: str = chosen("direct", EXECUTORS)  # of source=aec: direct (straight in joint space), or optimised (collision-free)
     collector: str = chosen("local", COLLECTORS)  # of source=aec: local, multiprocess or ray
     workers: int = bounded(2, 1, 256)  # of collector=multiprocess and ray
-    steps: int = bounded(48_000, 1, 10**9)  # commanded transfers, over all cells
+    steps: int = bounded(24_000, 1, 10**9)  # commanded transfers, over all cells
     num_envs: int = bounded(64, 1, 65_536)
     seed: int = seed_field()
     device: str = "cpu"  # cpu, cuda, cuda:N

@@ -19,12 +19,12 @@ from marl_handover.cell import load_cell
 from marl_handover.compose import to_yaml
 from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, WorkFailed, first_line
 from marl_handover.files import remove_temporaries, write_whole
-from marl_handover.learning.algorithm import OwnTorch, subnormals_flushed
+from marl_handover.learning.algorithm import OwnTorch, compile_state, subnormals_flushed
 from marl_handover.learning.algorithm_settings import OffPolicyConfig, PpoConfig
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
 from marl_handover.learning.curriculum import Curriculum
 from marl_handover.learning.experience import Collected
-from marl_handover.learning.recorder import Recorder, require_sound
+from marl_handover.learning.recorder import Recorder, machine, require_sound
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.variants import make_variant
 from marl_handover.locks import claimed
@@ -241,8 +241,10 @@ class Trainer:
         summary = {
             **asdict(self.counters),
             "best_step": self.best["step"],
+            "selection": {"score": self.best["score"], "episodes": self.config.evaluation_episodes, "steps_weight": STEPS_WEIGHT},
+            "compile_state": compile_state(self.algorithm),
+            "machine": machine(),
             "seed": self.config.seed,
-            "torch": torch.__version__,
             "validation": validation,
         }
         write_whole(self.folder / "summary.json", json.dumps(summary, indent=2) + "\n")

@@ -24,7 +24,6 @@ LEGEND_LINE_IN = 0.17
 MEASURES = {
     "success_rate": ("success", 100.0, "{:.2f} %"),
     "success_in_the_end": ("success in the end", 100.0, "{:.2f} %"),
-    "mean_steps": ("mean transfers an episode", 1.0, "{:.2f}"),
     "mean_steps_success": ("mean transfers, solved episodes", 1.0, "{:.2f}"),
     "steps_ratio": ("transfers ÷ optimum, solved episodes", 1.0, "{:.3f}"),
     "path_mm": ("way of the grip in a transfer, mm", 1.0, "{:.0f}"),

@@ -41,8 +41,8 @@ def suite(tmp_path) -> Suite:
     return load_suite(written(tmp_path, MINIMAL))
 
 
-def test_the_three_suites_are_shipped():
-    assert SHIPPED == ["ablations", "paper", "variants"]
+def test_four_suites_are_shipped():
+    assert SHIPPED == ["ablations", "paper", "seeds", "variants"]
 
 
 @pytest.mark.parametrize("name", SHIPPED)

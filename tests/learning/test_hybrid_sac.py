@@ -114,17 +114,29 @@ def test_terminated_target_is_the_scaled_reward(learner, batch):
 
 def test_candidates_draw_the_mean_only_where_they_are_better(learner, batch):
     present, _ = unpacked(batch)
-    mean = learner.loss.actor(present["observation"]).mean.tanh().detach()
+    own = learner.loss.actor(present["observation"]).mean.tanh()
+    mean = own.detach()
     anywhere, still = torch.rand(len(batch), 2, 8, 2) * 2 - 1, torch.zeros(len(batch), 2, 1, 2)
-    assert learner.loss._candidate_loss(present, mean, still) == 0  # no better than what is there
+    assert learner.loss._candidate_loss(present, own, mean, still) == 0  # no better than what is there
     learner.config.candidate_margin = 1e6
-    assert learner.loss._candidate_loss(present, anywhere, still) == 0  # not better by enough
+    assert learner.loss._candidate_loss(present, own, anywhere, still) == 0  # not better by enough
     learner.config.candidate_margin = 0.0
-    loss = learner.loss._candidate_loss(present, anywhere, still)
+    loss = learner.loss._candidate_loss(present, own, anywhere, still)
     loss.backward()
     assert loss > 0
     assert gradients(learner.loss.actor) > 0
     assert gradients(learner.loss.critic) == 0
+
+
+def test_what_is_kept_is_the_average_of_the_actors_last_steps(learner, batch):
+    kept = [parameter.clone() for parameter in learner.actor().parameters()]
+    for _ in range(3):
+        learner.update(batch)
+        trained = list(learner.loss.actor.parameters())
+        kept = [old + learner.config.actor_tau * (new.detach() - old) for old, new in zip(kept, trained, strict=True)]
+    for own, expected in zip(learner.actor().parameters(), kept, strict=True):
+        torch.testing.assert_close(own, expected, rtol=1e-5, atol=1e-7)
+    assert any(bool((own != new).any()) for own, new in zip(learner.actor().parameters(), trained, strict=True))
 
 
 def test_value_is_the_mean_over_sampled_branches(learner, batch, replay):

@@ -42,14 +42,18 @@ def row(name, label, seed, algorithm="sac", evaluations=("kinematic", "bullet"),
         scores = random.random(runs)
         steps_taken = 1 + 19 * random.random(runs)
         for run, score, taken in zip(content["runs"], scores, steps_taken, strict=True):
-            run["evaluations"][evaluation] = {"success_rate": score, "mean_steps": taken, "steps_ratio": 1 + taken / 100}
+            run["evaluations"][evaluation] = {"success_rate": score, "mean_steps_success": taken, "steps_ratio": 1 + taken / 100}
         counts = random.multinomial(1000, [0.25] * 4)
         content["evaluations"][evaluation] = {
             "episodes": 1000,
             "outcomes": dict(zip(OUTCOMES, counts.tolist(), strict=True)),
             **{
                 measure: {"value": float(np.mean(values)), "low": float(min(values)), "high": float(max(values))}
-                for measure, values in (("success_rate", scores), ("mean_steps", steps_taken), ("steps_ratio", 1 + steps_taken / 100))
+                for measure, values in (
+                    ("success_rate", scores),
+                    ("mean_steps_success", steps_taken),
+                    ("steps_ratio", 1 + steps_taken / 100),
+                )
             },
         }
     return content
@@ -94,7 +98,7 @@ def test_curves_are_tidy(results, x, assert_tidy):
 
 
 @pytest.mark.parametrize("results", [MANY, FEW, ALONE], ids=["many", "few", "alone"])
-@pytest.mark.parametrize("measure", ["success_rate", "mean_steps", "steps_ratio"])
+@pytest.mark.parametrize("measure", ["success_rate", "mean_steps_success", "steps_ratio"])
 def test_bars_are_tidy(results, measure, assert_tidy):
     assert_tidy(bars_figure(results, spec("bars", measure=measure)))
 
