@@ -32,11 +32,12 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP)
 	rm -rf runs/demo
-	$(RUN) train out=runs/demo
+	$(RUN) train preset=epsilon_5deg out=runs/demo
 	$(RUN) evaluate policy=runs/demo episodes=10000 json=runs/demo/evaluation.json
 	$(RUN) evaluate policy=exact episodes=10000 json=runs/demo/exact.json
 	$(RUN) workspace out=runs/demo
 	$(RUN) plot kind=run run=runs/demo
+	@$(BIN)/python scripts/expected_range.py runs/demo/evaluation.json epsilon_5deg
 	@echo "The run, its evaluation and the pictures are in runs/demo"
 
 test: $(STAMP)

@@ -8,6 +8,8 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from marl_handover.config import require_choice
+
 Tree = Mapping[str, Any]
 NONE = "–"
 SOLVED = (("mean_steps_success", "steps (solved)", "{:.2f}"), ("steps_ratio", "steps ÷ optimum (solved)", "{:.3f}"))
@@ -216,6 +218,29 @@ def _range(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
             cells.append(_plain(statistics.median(seconds) if seconds else None))
             rows.append([*cells, _text(", ".join(dict.fromkeys(report["machine"]["cpu"] for report in reports)))])
     return columns, rows
+
+
+def expected_lines(results: Tree, name: str, found: Tree) -> list[str]:
+    """What a run brought, beside what the runs of a row did: one line for each measure.
+
+    Args:
+        results: content of ``results.json`` of a suite with that row.
+        name: of the row.
+        found: report of the run's own evaluation, as ``evaluate json=FILE`` has it.
+
+    Raises:
+        UnknownChoice: no such row.
+    """
+    require_choice("row", name, [row["name"] for row in results["rows"]])
+    (row,) = _wanted(results, [name])
+    reports = [report for run in row["runs"] for report in run["evaluations"].values()]
+    processors = ", ".join(dict.fromkeys(report["machine"]["cpu"] for report in reports))
+    lines = [f"To expect: worst / median / best of {len(row['runs'])} seeds on {processors}"]
+    for key, title, form, scale, worst in RANGED:
+        value = found.get(key)
+        brought = NONE if value is None else form.format(scale * value)
+        lines.append(f"{title + ':':<27}{brought:>8}   to expect: {_ends([report[key] for report in reports], form, scale, worst).text}")
+    return lines
 
 
 def _ends(values: Sequence[float | None], form: str, scale: float, worst: Callable[[Sequence[float]], float]) -> Cell:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from marl_handover.compare.results import _sooner
-from marl_handover.compare.tables import csv_text, make_tables, markdown
+from marl_handover.compare.tables import csv_text, expected_lines, make_tables, markdown
+from marl_handover.errors import UnknownChoice
 
 
 def row(budget: int, *reached: int | None):
@@ -33,6 +34,41 @@ def test_a_run_is_not_called_slower_than_another_that_was_given_longer(first, se
     assert _sooner(first, second)["value"] == probability
     assert _sooner(second, first)["value"] == 1 - probability
     assert _sooner(first, second)["until_step"] == min(first["settings"]["steps"], second["settings"]["steps"])
+
+
+RATES, RATIOS = (0.9985, 1.0, 0.9999), (1.03, 1.002, 1.01)
+
+
+def ranged(ratios=RATIOS):
+    runs = [
+        {
+            "trained": {"wall_s": 60.0 + number},
+            "evaluations": {"k": {"episodes": 10000, "success_rate": rate, "steps_ratio": ratio, "machine": {"cpu": "a processor"}}},
+        }
+        for number, (rate, ratio) in enumerate(zip(RATES, ratios, strict=True))
+    ]
+    return {
+        "tables": [{"name": "t", "kind": "range", "title": "", "rows": [], "evaluations": []}],
+        "evaluations": [{"name": "k", "label": ""}],
+        "rows": [{"name": "a", "label": "a", "evaluations": {"k": {}}, "runs": runs}],
+    }
+
+
+def test_a_range_is_the_worst_the_median_and_the_best_of_the_runs():
+    (table,) = make_tables(ranged())
+    assert "| a | k | 3 | 10,000 | 99.85 / 99.99 / 100.00 | 1.030 / 1.010 / 1.002 | 61 | a processor |" in markdown(table)
+    assert "success_rate_worst,success_rate_median,success_rate_best,steps_ratio_worst" in csv_text(table)
+    # A run that solved nothing has no ratio: no worst can be told.
+    assert "| 99.85 / 99.99 / 100.00 | – |" in markdown(make_tables(ranged((1.03, None, 1.01)))[0])
+
+
+def test_what_a_run_brought_stands_beside_what_was_to_be_expected():
+    lines = "\n".join(expected_lines(ranged(), "a", {"success_rate": 0.9992, "steps_ratio": 1.012}))
+    assert "worst / median / best of 3 seeds on a processor" in lines
+    assert "99.92   to expect: 99.85 / 99.99 / 100.00" in lines
+    assert "1.012   to expect: 1.030 / 1.010 / 1.002" in lines
+    with pytest.raises(UnknownChoice):
+        expected_lines(ranged(), "b", {})
 
 
 def test_how_many_runs_have_solved_anything_is_told():

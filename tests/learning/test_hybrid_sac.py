@@ -159,8 +159,9 @@ def test_value_is_the_mean_over_sampled_branches(learner, batch, replay):
                 value[branch] = critic.value_final(blocks[:, arm]).amin()
                 continue
             action = torch.tensor([[-1.0, 2.0 * arm - 1.0, *place[0, arm, choice - 1]]])
-            placed, _ = rules.transfer(present["pose"], present["goal"], rules.decode(action))
-            after = observe(rules, "relative", placed, present["goal"], torch.tensor([arm]), present["epsilon"]).view(1, 2, -1)
+            placed, feasible = rules.transfer(present["pose"], present["goal"], rules.decode(action))
+            last = torch.where(feasible, arm, present["previous_arm"])  # an arm that does not reach the object has not moved it
+            after = observe(rules, "relative", placed, present["goal"], last, present["epsilon"]).view(1, 2, -1)
             q = critic.value_place(after if arm == 0 else after.flip(1)).amin()
             value[branch] = q - learner.loss.log_temperatures[0].exp() * place_log_prob[0, arm, choice - 1]
         drawn = torch.multinomial(log_prob.exp(), 200_000, replacement=True)
