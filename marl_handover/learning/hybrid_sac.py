@@ -232,6 +232,13 @@ class HybridSac(Algorithm):
         """How the actor reads its blocks."""
         return {key: getattr(self.config, key) for key in ("modes", "canonical", "harmonics")}
 
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state_dict`; a checkpoint from before there was an average starts one from the actor it has."""
+        older = {} if "average" in state else {"average": self.trained().state_dict()}
+        super().load_state_dict({**state, **older})
+        if older:
+            self.average.load_state_dict(self.trained().state_dict())
+
     def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
         """The loss module holds all networks that are trained, and the temperatures."""
         return {

@@ -74,6 +74,15 @@ MOST_BYTES, MOST_WEIGHTS, MOST_ACTIVATIONS = 500 * 10**6, 8 * 10**6, 64 * 10**6
 """Of a replay memory, of one network, and of one layer's output for one batch; a training takes several times each."""
 
 
+def wide_first() -> list[StageConfig]:
+    """Ranges of epsilon that end lower and lower.
+
+    At a small epsilon a place that takes a transfer more than another is a sharp peak of the value, and a policy that is at it stays; at a
+    large one the peaks are wide and it moves to the best.
+    """
+    return [StageConfig(8.0, 15.0, until_step=8_000), StageConfig(3.0, 12.0, until_step=14_000), StageConfig(0.7, 12.0)]
+
+
 @dataclass
 class TrainConfig:
     """A training run."""
@@ -82,7 +91,7 @@ class TrainConfig:
     task: TaskConfig = field(default_factory=TaskConfig)
     algorithm: AlgorithmConfig = field(default_factory=SacConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
-    curriculum: list[StageConfig] = sized(lambda: [StageConfig(0.7, 12.0)], 1, 100)
+    curriculum: list[StageConfig] = sized(wide_first, 1, 100)
     variant: str = chosen("hierarchical", tuple(VARIANTS))  # hierarchical, centralised or decentralised
     centralised: CentralisedConfig = field(default_factory=CentralisedConfig)
     decentralised: DecentralisedConfig = field(default_factory=DecentralisedConfig)
@@ -91,7 +100,7 @@ class TrainConfig:
     executor: str = chosen("direct", EXECUTORS)  # of source=aec: direct (straight in joint space), or optimised (collision-free)
     collector: str = chosen("local", COLLECTORS)  # of source=aec: local, multiprocess or ray
     workers: int = bounded(2, 1, 256)  # of collector=multiprocess and ray
-    steps: int = bounded(24_000, 1, 10**9)  # commanded transfers, over all cells
+    steps: int = bounded(32_000, 1, 10**9)  # commanded transfers, over all cells
     num_envs: int = bounded(64, 1, 65_536)
     seed: int = seed_field()
     device: str = "cpu"  # cpu, cuda, cuda:N

@@ -9,6 +9,7 @@ import torch
 from marl_handover import cli, policies
 from marl_handover.commands.plan import solve
 from marl_handover.errors import InvalidSetting, UnknownChoice
+from marl_handover.learning.algorithm import stepped
 from marl_handover.learning.centralised_sac import with_actions
 from marl_handover.learning.export import policy_arrays, save_policy
 from marl_handover.learning.trainer import Trainer
@@ -74,7 +75,7 @@ def test_positions_are_read_off_the_observation(trainer, draw):
 
 def test_the_policy_keeps_the_mirror_law(trainer, draw):
     start, goal, previous, _ = (torch.tensor(part) for part in draw(trainer.rules.cell, 300, 2))
-    rules, actor = trainer.rules, trainer.algorithm.loss.actor
+    rules, actor = trainer.rules, trainer.algorithm.actor()
     torch.nn.init.normal_(actor.move[-1].weight, std=0.5)  # it begins with zeros, which every law holds for
     action = trainer.algorithm.act(observe(rules, "relative", start, goal, previous).float())
     assert action[:, 4:].std() > 0.1
@@ -106,7 +107,7 @@ def test_the_critic_foresees_refusals(trainer):
     for _ in range(100):
         present, following = with_actions(trainer.replay.sample(256))
         noise = torch.randn(256, algorithm.loss.noise_width, generator=random)
-        algorithm._step(algorithm.critic_optimizer, algorithm.loss.critic_loss(present, following, noise))
+        stepped(algorithm.critic_optimizer, algorithm.loss.critic_loss(present, following, noise))
     assert separation() > max(0.75, before + 0.1)
 
 
