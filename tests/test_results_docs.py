@@ -19,6 +19,7 @@ BLOCKS = blocks(PAGE)
 EVIDENCE = read_evidence(ROOT / "bench" / "results" / "compare")
 SINGLE = ROOT / "bench" / "results" / "2026-11-22"
 """Runs outside the suites."""
+LATER = ROOT / "bench" / "results" / "2026-11-30"
 SUITES = sorted(path.stem for path in suite_folder().glob("*.yaml"))
 
 
@@ -160,6 +161,21 @@ def test_what_the_page_says_of_single_runs_is_what_they_say():
     random = json.loads((SINGLE / "random_a_30deg.json").read_text())
     assert (random["policy"], random["architecture"], random["epsilon_deg"]) == ("random", "A", 30.0)
     assert f"even with 30° it takes {random['mean_steps']:.1f} " in said
+    judged = json.loads((LATER / "actor_and_critic.json").read_text())["rows"]
+    ratio = {(row["branch"], row["place"]): f"{row['steps_ratio']:.3f}" for row in judged}
+    for words in (
+        f"that took {ratio['actor', 'actor']} times the optimum",
+        f"solved all of them in {ratio['critic', 'critic']} times",
+        f"the critic's places it was {ratio['actor', 'critic']}, with the critic's choice and the actor's places {ratio['critic', 'actor']}",
+    ):
+        assert words in said
+    wide = json.loads((LATER / "random_a_40deg.json").read_text())
+    assert (wide["policy"], wide["architecture"], wide["epsilon_deg"]) == ("random", "A", 40.0)
+    assert f"and with 40° {wide['mean_steps']:.1f}." in said
+    with open(LATER / "paper_b_40deg" / "metrics.csv", newline="", encoding="utf-8") as lines:
+        last = list(csv.DictReader(lines))[-1]
+    reached = f"{100 * float(last['success_rate']):.0f} % of its 1,000 validation problems after {int(last['step']):,} transfers"
+    assert f"one run of B solves {reached} and {int(last['gradient_step']):,} gradient steps" in said
     raw = json.loads((SINGLE / "dqn_raw" / "evaluation.json").read_text())
     steps = json.loads((SINGLE / "dqn_raw" / "summary.json").read_text())["step"]
     assert f"Without both B's solves {100 * raw['success_rate']:.2f} % after {steps:,} transfers (one seed)" in said

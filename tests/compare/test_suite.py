@@ -41,8 +41,8 @@ def suite(tmp_path) -> Suite:
     return load_suite(written(tmp_path, MINIMAL))
 
 
-def test_four_suites_are_shipped():
-    assert SHIPPED == ["ablations", "paper", "seeds", "variants"]
+def test_five_suites_are_shipped():
+    assert SHIPPED == ["ablations", "paper", "paper_steps", "seeds", "variants"]
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -62,7 +62,7 @@ def test_every_shipped_row_composes(name, size):
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_shipped_suite_has_its_seeds_and_pictures_of_each_kind_it_names(name):
     suite = load_suite(name)
-    assert suite.seeds == (20 if name == "seeds" else 5)
+    assert suite.seeds == {"seeds": 20, "paper_steps": 3}.get(name, 5)
     assert {"evaluation", "milestones", "runs"} <= {table.kind for table in suite.tables}
     assert {"curves", "bars"} <= {figure.kind for figure in suite.figures}
 
