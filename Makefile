@@ -37,7 +37,7 @@ demo: $(STAMP)
 	$(RUN) evaluate policy=exact episodes=10000 json=runs/demo/exact.json
 	$(RUN) workspace out=runs/demo
 	$(RUN) plot kind=run run=runs/demo
-	@$(BIN)/python scripts/expected_range.py runs/demo/evaluation.json epsilon_5deg
+	-@$(BIN)/python scripts/expected_range.py runs/demo/evaluation.json epsilon_5deg
 	@echo "The run, its evaluation and the pictures are in runs/demo"
 
 test: $(STAMP)

@@ -15,6 +15,8 @@ STORED = Path(__file__).resolve().parents[1] / "bench" / "results" / "compare" /
 if __name__ == "__main__":
     if len(sys.argv) != 3:
         sys.exit(__doc__)
+    if not STORED.is_file():
+        sys.exit(f"what to expect has not been measured: {STORED} is missing")
     try:
         found = read_json(Path(sys.argv[1]), "evaluation")
         print("\n".join(expected_lines(read_json(STORED, "stored results"), sys.argv[2], found)))
