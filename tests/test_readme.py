@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import statistics
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 LEARNING = (ROOT / "docs" / "concepts" / "learning.md").read_text(encoding="utf-8")
 MOTION = (ROOT / "docs" / "concepts" / "motion.md").read_text(encoding="utf-8")
 RESULTS = ROOT / "bench" / "results" / "2026-11-22"
+SEEDS = ROOT / "bench" / "results" / "compare" / "seeds" / "results.json"
 
 
 def test_a_picture_comes_first_and_then_the_two_commands():
@@ -40,6 +42,19 @@ def test_the_result_table_says_what_the_runs_say(run):
         and f"{summary['wall_s']:.0f}" in row
     ]
     assert len(rows) == 1
+
+
+def test_the_range_of_the_demo_is_that_of_its_stored_seeds():
+    (row,) = [row for row in json.loads(SEEDS.read_text())["rows"] if row["name"] == "epsilon_5deg"]
+    reports = [run["evaluations"]["kinematic"] for run in row["runs"]]
+    rates, ratios = (
+        sorted(report["success_rate"] for report in reports),
+        sorted((report["steps_ratio"] for report in reports), reverse=True),
+    )
+    success = " / ".join(f"{100 * rate:.2f}" for rate in (rates[0], statistics.median(rates), rates[-1]))
+    ratio = " / ".join(f"{ratio:.3f}" for ratio in (ratios[0], statistics.median(ratios), ratios[-1]))
+    assert f"(`make demo`), {len(reports)} seeds: worst / median / best | {success} % | {ratio} |" in TEXT
+    assert all(report["episodes"] == 10_000 for report in reports)
 
 
 def test_the_page_on_learning_says_what_one_accuracy_alone_is_worth():

@@ -170,6 +170,10 @@ def test_what_the_page_says_of_single_runs_is_what_they_say():
         f"choice and the actor's places {ratio['critic', 'actor']}",
     ):
         assert words in said
+    short = [json.loads(path.read_text())["evaluation"] for path in sorted((LATER / "default_24k").glob("*.json"))]
+    rates, ratios = [100 * found["success_rate"] for found in short], [found["steps_ratio"] for found in short]
+    assert len(short) == 4
+    assert f"brought {min(rates):.2f} to {max(rates):.2f} % at {min(ratios):.3f} to {max(ratios):.3f} times the optimum" in said
     wide = json.loads((LATER / "random_a_40deg.json").read_text())
     assert (wide["policy"], wide["architecture"], wide["epsilon_deg"]) == ("random", "A", 40.0)
     assert f"and with 40° {wide['mean_steps']:.1f}." in said
