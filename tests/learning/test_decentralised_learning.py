@@ -205,7 +205,7 @@ def test_each_arm_asks_its_own_network(learner_of, paper, learners):
     left, right = (seen[:, FIELDS] == side for side in (-1.0, 1.0))
     before = learner.act(seen)
     with torch.no_grad():
-        for parameter in learner.actors[0].parameters():
+        for parameter in learner.average[0].parameters():
             parameter.add_(0.3)
     after = learner.act(seen)
     assert not torch.equal(before[left], after[left])
@@ -216,7 +216,7 @@ def test_episodes_in_which_both_pass_time_out_and_have_used_up_their_time(learne
     learner = learner_of("shared")
     problems = sample_problems(paper, 50, torch.Generator().manual_seed(1), torch.float32)
     with torch.no_grad():
-        learner.actors[0].net[-1].bias[PASS] += 1e3
+        learner.average[0].net[-1].bias[PASS] += 1e3
     episodes = variant.play(learner, *problems)
     assert (episodes.outcome == int(Outcome.TIMEOUT)).all()
     assert (episodes.transfers == learner.rules.config.max_steps).all()
