@@ -45,7 +45,7 @@ def made(paper, draw, tmp_path_factory):
         start, goal, previous, _ = draw(paper, 500, 9)
         blocks = torch.tensor(observe(algorithm.rules, "relative", start, goal, previous).astype(np.float32)).unflatten(-1, (2, -1))
         with torch.no_grad():
-            for actor in algorithm.actors:
+            for actor in algorithm.average.children():
                 logits = actor(blocks.flatten(0, 1)).logits[:, 0]
                 lead = logits[:, PASS] - logits[:, [FINISH, *range(PLACE, logits.shape[-1])]].amax(-1)
                 actor.net[-1].bias[PASS] -= lead.quantile(1 - waits)
