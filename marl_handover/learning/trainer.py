@@ -238,10 +238,15 @@ class Trainer:
 
     def _summarise(self) -> dict[str, Any]:
         validation = {key: None if math.isnan(value) else value for key, value in self.last.items()}
+        score = self.best["score"] if math.isfinite(self.best["score"]) else None
         summary = {
             **asdict(self.counters),
             "best_step": self.best["step"],
-            "selection": {"score": self.best["score"], "episodes": self.config.evaluation_episodes, "steps_weight": STEPS_WEIGHT},
+            "selection": {
+                "score": score,
+                "episodes": self.config.evaluation_episodes,
+                "steps_weight": STEPS_WEIGHT,
+            },
             "compile_state": compile_state(self.algorithm),
             "machine": machine(),
             "seed": self.config.seed,
