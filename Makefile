@@ -44,7 +44,7 @@ test: $(STAMP)
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS)
 
 test-slow: $(STAMP)
-	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) -m "slow and not gpu and not hardware"
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) --timeout 1800 -m "slow and not gpu and not hardware"
 
 fuzz: $(STAMP)
 	$(ONE_THREAD) $(BIN)/python tests/fuzz_command_lines.py 20000

@@ -156,16 +156,23 @@ class Feed:
 
     def latch(self) -> StopLatch:
         """The stop of this session; before any state was read, the usual one. What the session signed up with is believed first."""
-        signed = self._signed()
-        path = signed.stop_file if signed is not None else (self._state or {}).get("stop_file") or HardwareConfig().stop_path()
-        return StopLatch(str(path))
+        return StopLatch(str(self._stop_files()[0]))
 
-    def _signed(self) -> Signed | None:
-        """The session as it is on this user's roll; None if it is not."""
+    def _stop_files(self) -> list[Path]:
+        """The stop files that this session may look at, the likeliest first.
+
+        A process can hold several sessions, and one that has not connected yet has not signed up: its state alone names its file then.
+        """
+        signed = [session.stop_file for session in self._signed() if session.stop_file is not None]
+        told = Path(str((self._state or {}).get("stop_file") or HardwareConfig().stop_path()))
+        return [told] if told in signed else [*signed, told]
+
+    def _signed(self) -> list[Signed]:
+        """The sessions of the state's process as they are on this user's roll."""
         state = self._state
         if state is None or not _here(state):
-            return None
-        return next((session for session in Roll().signed() if session.pid == state["pid"]), None)
+            return []
+        return [session for session in Roll().signed() if session.pid == state["pid"]]
 
     def stop(self, reason: str) -> str:
         """Latch the stop: allowed whatever ``view_control`` says. What was done, for people.
@@ -173,20 +180,24 @@ class Feed:
         A file that is no stop file is not replaced, whatever the state says. If the latch cannot be written, the session's process is
         interrupted, which stops every channel too; but only one that has signed up on this computer.
         """
-        reading, latch = self.read(), self.latch()
-        failed = _not_a_latch(latch.path)
-        if not failed:
-            try:
-                latch.latch(reason)
-                return f"stop latched in {latch.path}"
-            except OSError as error:
-                failed = f"the stop file {latch.path} cannot be written ({error.strerror or error})"
+        reading, latched, failed = self.read(), [], ""
+        for path in self._stop_files():
+            trouble = _not_a_latch(path)
+            if not trouble:
+                try:
+                    StopLatch(path).latch(reason)
+                    latched.append(str(path))
+                except OSError as error:
+                    trouble = f"the stop file {path} cannot be written ({error.strerror or error})"
+            failed = failed or trouble
+        if latched and not failed:
+            return f"stop latched in {' and '.join(latched)}"
         signed = self._signed()
-        if reading.live and signed is not None:
+        if reading.live and signed:
             with contextlib.suppress(OSError, OverflowError):
-                os.kill(signed.pid, signal.SIGINT)
-                return f"{failed}; interrupted process {signed.pid} instead"
-        return f"{failed}: CUT THE POWER"
+                os.kill(signed[0].pid, signal.SIGINT)
+                return f"{failed}; interrupted process {signed[0].pid} instead"
+        return f"stop latched in {' and '.join(latched)}; {failed}" if latched else f"{failed}: CUT THE POWER"
 
 
 def require_own(folder: Path) -> None:

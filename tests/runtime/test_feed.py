@@ -256,20 +256,29 @@ def test_stop_replaces_no_file_that_is_no_stop_file(tmp_path):
         assert StopLatch(tmp_path / "stop").reason() == reason
 
 
-def test_what_a_session_signed_up_with_counts_more_than_what_its_folder_says(tmp_path):
-    Roll().folder.mkdir(exist_ok=True)
-    signed = Roll().folder / f"{os.getpid()}-feed.json"
-    signed.write_text(json.dumps({"pid": os.getpid(), "stop_file": str(tmp_path / "true")}))
-    try:
-        put(tmp_path, state(stop_file=str(tmp_path / "false")))
-        assert str(tmp_path / "true") in Feed(tmp_path).stop("page")
-        assert not (tmp_path / "false").exists()
-    finally:
-        signed.unlink()
+def test_a_stop_reaches_what_a_session_signed_up_with_and_what_its_folder_says(tmp_path):
+    """A session that has not connected yet has not signed up, while another one of the same process may have."""
+    entry = Roll().sign(tmp_path / "signed")
+    put(tmp_path, state(stop_file=str(tmp_path / "told")))
+    assert Feed(tmp_path).stop("page") == f"stop latched in {tmp_path / 'signed'} and {tmp_path / 'told'}"
+    assert StopLatch(tmp_path / "signed").reason() == StopLatch(tmp_path / "told").reason() == "page"
+    Roll.leave(entry)
+
+
+def test_of_several_sessions_of_a_process_only_the_one_that_is_shown_is_stopped(tmp_path):
+    entries = [Roll().sign(tmp_path / name) for name in ("other", "shown", "third")]
+    put(tmp_path, state(stop_file=str(tmp_path / "shown")))
+    feed = Feed(tmp_path)
+    assert feed.stop("page") == f"stop latched in {tmp_path / 'shown'}"
+    assert feed.latch().path == tmp_path / "shown"
+    assert not (tmp_path / "other").exists() and not (tmp_path / "third").exists()
+    for entry in entries:
+        Roll.leave(entry)
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root gives files away")
-def test_a_strangers_folder_and_his_files_in_ones_own_are_not_believed(tmp_path):
+def test_a_strangers_folder_and_his_files_in_ones_own_are_not_believed(tmp_path, monkeypatch):
+    monkeypatch.setattr("marl_handover.runtime.feed.HardwareConfig.stop_path", lambda _: tmp_path / "default")
     put(tmp_path, state(stop_file=str(tmp_path / "stop")))
     (tmp_path / PICTURE_FILE).write_bytes(jpeg(np.zeros((36, 64, 3), np.uint8)))
     (tmp_path / EVENTS_FILE).write_text('{"event": "a"}\n')
@@ -281,7 +290,6 @@ def test_a_strangers_folder_and_his_files_in_ones_own_are_not_believed(tmp_path)
         assert (feed.events() == []) == (name == EVENTS_FILE)
         if name in (STATE_FILE, ""):
             assert "another user (12345)" in feed.read().problem
-        feed.latch = lambda: StopLatch(tmp_path / "default")
         feed.stop("page")
         assert not (tmp_path / "stop").exists()
         os.chown(tmp_path / name, 0, 0)
