@@ -51,6 +51,8 @@ paces = st.sampled_from([0.97, 0.97, 0.97, 0.7, 0.4, 0.15, 0.05, 1.2, 3.0])
 ages_s = st.sampled_from([0.0] * 12 + [0.2, 0.4])
 commands = st.tuples(st.integers(0, 2), st.booleans(), paces, st.sampled_from(TIMES_S), st.floats(0.0, 1.3), ages_s, rubbish)
 aims = st.tuples(st.sampled_from([0, 1, 2, 3, 3, 4, 5]), st.integers(0, 399), st.integers(0, 399))
+# The left arm alone, straight for joints beyond their limits: the pulse limits of its base come first, however the random ones fall out.
+TO_THE_PULSE_LIMIT = [(start, ((1, start, start),) * 2, [(0, False, 0.97, 0.2, 1.0, 0.0, None)] * 20) for start in range(6)]
 sequences = st.tuples(st.integers(0, 399), st.tuples(aims, aims), st.lists(commands, min_size=8, max_size=20))
 
 
@@ -239,6 +241,9 @@ def cut(make):
 
 def check_sequences(rig, count):
     playground = Playground(rig)
+    for sequence in TO_THE_PULSE_LIMIT:
+        playground.play(sequence)
+    assert playground.met[Reason.PULSE_LIMIT]
 
     @settings(max_examples=count, phases=[Phase.generate])
     @given(sequences)
