@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -20,6 +23,16 @@ TINY = (
     *("preset=smoke", "progress=false", "steps=768", "num_envs=16", "evaluation_interval=256", "checkpoint_interval=256"),
     *("evaluation_episodes=20", "algorithm.learning_starts=300", "algorithm.steps_per_update=32", "algorithm.batch_size=32"),
 )
+
+
+HOLDER = """
+import sys
+from pathlib import Path
+from marl_handover.locks import claimed
+with claimed(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +81,26 @@ def test_resuming_a_finished_run_changes_nothing(finished, capsys):
     after = torch.load(finished / "checkpoint.pt", weights_only=True)["algorithm"]["loss"]
     assert rows(finished) == before
     assert all(torch.equal(value, after[key]) for key, value in weights.items())
+
+
+@pytest.mark.parametrize("key", ["out", "resume"])
+def test_a_folder_in_which_another_training_runs_is_left_as_it_is(finished, tmp_path, capsys, key):
+    folder = tmp_path / "run"
+    if key == "resume":
+        shutil.copytree(finished, folder)
+    else:
+        folder.mkdir()
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    other = subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert other.stdout.readline() == "held\n"
+    assert main(["train", *(TINY if key == "out" else ["progress=false"]), f"{key}={folder}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "another training writes into it" in line
+    other.communicate("")
+    (folder / ".lock").unlink(missing_ok=True)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
+        name: content for name, content in before.items() if name != ".lock"
+    }
 
 
 def test_a_run_killed_before_its_first_checkpoint_starts_again(finished, tmp_path):
