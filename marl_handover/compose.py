@@ -135,6 +135,8 @@ class _Composer:
         self.tree = SchemaTree(schema, aliases)
         self.groups = {tuple(group.split(".")): options for group, options in groups.items()}
         self.aliases, self.configs = aliases, configs
+        self.references: list[tuple[Keys, str, Path | None]] = []
+        """What was set by a reference such as ``${seed}``: only when all is set is its value known, and its kind checked."""
 
     def split(self, text: str) -> _Argument:
         """``text`` at its first ``=``, with a shorthand replaced by the key it stands for."""
@@ -189,6 +191,9 @@ class _Composer:
     def finish(self) -> Any:
         """The typed instance, every value within its bounds."""
         try:
+            for keys, text, file in tuple(self.references):
+                value = OmegaConf.select(self.tree.config, ".".join(keys))
+                self._assign(keys, OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value, text, file)
             config = OmegaConf.to_object(self.tree.config)
         except MissingMandatoryValue as error:
             raise BadOverride(f"{error.full_key}=…", "this setting has no default and must be given") from error
@@ -284,6 +289,8 @@ class _Composer:
                 return self._choose(keys, _Choice(value, file))
             if not (value is None and bare != kind):
                 raise BadOverride(text + where, f"{'.'.join(keys)} is a section; set one of: {', '.join(self.tree.names(keys))}")
+        if bare not in (str, Path) and "${" in str(value):
+            self.references.append((keys, text, file))
         try:
             self.tree.merge(keys, fitted(bare, value))
         except (OmegaConfBaseException, ValueError, TypeError, OverflowError) as error:

@@ -227,6 +227,9 @@ def test_wrong_types(make, text):
         "start.0=1",
         "task={a",
         "task.epsilon_deg=${nowhere}",
+        "start=${oc.env:PWD}",
+        "start=[0,1,${oc.env:PWD}]",
+        "start=${start}",
         "algorithm.name.x=1",
         "task=foo",
         "cell=null",
@@ -238,6 +241,11 @@ def test_malformed_overrides(make, text):
     with pytest.raises(BadOverride) as caught:
         make(text)
     assert "\n" not in str(caught.value)
+
+
+def test_a_reference_takes_the_value_that_its_key_has_in_the_end(make):
+    config = make("task.epsilon_deg=${seed}", "start=[${seed},0,1]", "seed=7")
+    assert (config.task.epsilon_deg, list(config.start), config.seed) == (7.0, [7.0, 0.0, 1.0], 7)
 
 
 def test_unknown_options(make):
