@@ -1,4 +1,4 @@
-"""The safety gate judged from outside: what it lets through, what it refuses for nothing, and what it costs against another commit.
+"""The safety filter judged from outside: what it lets through, what it refuses for nothing, and what it costs against another commit.
 
 python bench/gate.py commands=100000 samples=1000 seed=0 against=ca43d75
 
@@ -33,7 +33,7 @@ from marl_handover.geometry.capsules import capsule_pairs
 from marl_handover.geometry.se3 import transform
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import nominal_calibration
-from marl_handover.hardware.gate import LAG_S, GateRejection, JointCommand, Reason, SafetyGate
+from marl_handover.hardware.safety_filter import LAG_S, CommandRejected, JointCommand, Reason, SafetyFilter
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.motion.collision_model import block_capsules
 from marl_handover.motion.planner import MotionPlanner
@@ -326,7 +326,7 @@ class Court:
     def __init__(self, seed: int, cell: str = "paper") -> None:
         self.model, self.config = build_cell(cell_config(cell)), HardwareConfig()
         limits = self.config.gate
-        self.gate = SafetyGate(self.model, self.config, [nominal_calibration(self.config, arm, self.model.arm) for arm in ARMS])
+        self.gate = SafetyFilter(self.model, self.config, [nominal_calibration(self.config, arm, self.model.arm) for arm in ARMS])
         self.bodies, self.draw = bodies_of(self.model), Draw(self.model, self.config, seed)
         self.bases = np.array([transform((b.x_mm, b.y_mm, 0.0), (0.0, 0.0, b.facing_rad)) for b in self.model.cell.bases])
         self.promised = np.array([limits.table_clearance_mm, limits.self_clearance_mm, limits.arm_clearance_mm, -limits.block_dip_mm])
@@ -341,7 +341,7 @@ class Court:
         refusal = None
         try:
             self.gate.check(drawn.commands, drawn.duration_s, now_s, now_s)
-        except GateRejection as rejection:
+        except CommandRejected as rejection:
             refusal = rejection.reason
         moving = np.array([any(command.arm == arm for command in drawn.commands) for arm in range(2)])
         holding, least = np.array(drawn.fingers) < OPEN_MM, np.empty(4)
@@ -404,12 +404,12 @@ import numpy as np
 from marl_handover.cell.build import build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.hardware.calibration import nominal_calibration
-from marl_handover.hardware.gate import JointCommand, SafetyGate
+from marl_handover.hardware.safety_filter import JointCommand, SafetyFilter
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 
 track = np.load(sys.argv[1])
 model, config = build_cell(cell_config("paper")), HardwareConfig()
-gate = SafetyGate(model, config, [nominal_calibration(config, arm, model.arm) for arm in ARMS])
+gate = SafetyFilter(model, config, [nominal_calibration(config, arm, model.arm) for arm in ARMS])
 parked, costs, now_s = np.radians(MotionConfig().parked_deg), [], 1.0
 for _ in range(20):
     for arm in range(2):

@@ -19,7 +19,7 @@ from common import parse, table
 
 from marl_handover import policies
 from marl_handover.cli import main as command_line
-from marl_handover.hardware.gate import JointCommand
+from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.runtime.events import Event
 from marl_handover.runtime.hardware_backend import HardwareBackend
 from marl_handover.runtime.loop import make_loop
@@ -50,7 +50,7 @@ def beat(backend: HardwareBackend, seconds: float, publishing: bool) -> dict[str
             time.sleep(min(POLL_S, max(due - now, 0.0)))
         woken = time.perf_counter()
         for arm in (0, 1):
-            driver.gate.check([JointCommand(arm, driver.parked_rad, driver.gripper_mm(arm))], PERIOD_S, 1.0, 1.0)
+            driver.safety_filter.check([JointCommand(arm, driver.parked_rad, driver.gripper_mm(arm))], PERIOD_S, 1.0, 1.0)
         log.add(Event.STATE, joints_rad=np.round(driver.joints_rad(), 4), gripper_mm=[0.0, 0.0])
         if number % 50 == 0:  # a decision every 3 s
             log.add(Event.SEEN, pose=POSES[number // 50 % 2], goal=None)

@@ -97,7 +97,7 @@ class LimitWatch:
         self._over(f"{what} arm to arm, mm nearer", -gap, -apart_mm)
 
     def _speed(self, speed_rad_s: Floats) -> None:
-        self._over("sent speed, share", float((speed_rad_s / self._driver.gate.speed_rad_s).max()), SPEED_SHARE)
+        self._over("sent speed, share", float((speed_rad_s / self._driver.safety_filter.speed_rad_s).max()), SPEED_SHARE)
 
     def _over(self, name: str, value: float, limit: float) -> None:
         self.worst[name] = max(value, self.worst.get(name, -math.inf))

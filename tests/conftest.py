@@ -26,22 +26,22 @@ def pytest_configure():
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _sign_up_here(tmp_path_factory):
-    """Sessions of tests stay off the user's roll: they do not answer when somebody stops real arms meanwhile."""
-    from marl_handover.hardware import roll
+def _registry_of_tests(tmp_path_factory):
+    """Sessions of tests stay off the user's session registry: they do not answer when somebody stops real arms meanwhile."""
+    from marl_handover.hardware import session_registry
 
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("user")
-        patch.setattr(roll, "user_path", lambda suffix: folder / suffix)
+        patch.setattr(session_registry, "user_path", lambda suffix: folder / suffix)
         yield
 
 
 @pytest.fixture
-def alone(tmp_path, monkeypatch):
-    """No session of another test in this process is on the roll: what a page stops is then the session that the test made up."""
-    from marl_handover.hardware import roll
+def empty_session_registry(tmp_path, monkeypatch):
+    """No session of another test in this process is registered: what a page stops is then the session that the test made up."""
+    from marl_handover.hardware import session_registry
 
-    monkeypatch.setattr(roll, "user_path", lambda suffix: tmp_path / f"user{suffix}")
+    monkeypatch.setattr(session_registry, "user_path", lambda suffix: tmp_path / f"user{suffix}")
 
 
 @pytest.fixture(scope="session")

@@ -111,7 +111,7 @@ def _camera(config: CalibrateCommand, plugs: Plugs, assistant: Assistant) -> Non
 
 def _servos(config: CalibrateCommand, plugs: Plugs, assistant: Assistant, model: CellModel) -> None:
     from marl_handover.hardware.driver import ArmDriver
-    from marl_handover.hardware.latch import StopLatch
+    from marl_handover.hardware.estop import StopLatch
     from marl_handover.runtime.lab import camera_calibration
     from marl_handover.runtime.servo_calibration import ServoCalibration
     from marl_handover.runtime.servo_files import save_servos

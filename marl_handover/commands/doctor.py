@@ -136,7 +136,7 @@ def _access(path: Path) -> str:
 def _ports(config: DoctorConfig) -> Iterator[str]:
     """Ports by their lasting names; who is at them only if that is asked for: opening a port resets some devices."""
     try:
-        from marl_handover.hardware.ports import latency_ms, list_serial_ports
+        from marl_handover.hardware.transport import latency_ms, list_serial_ports
     except ImportError as error:
         yield f"cannot be listed: {error}"
         return
@@ -176,8 +176,8 @@ def _who(port: str) -> str:
 
 def _arms() -> Iterator[str]:
     """The latched stop, and which sessions could move arms now."""
-    from marl_handover.hardware.latch import StopLatch
-    from marl_handover.hardware.roll import Roll
+    from marl_handover.hardware.estop import StopLatch
+    from marl_handover.hardware.session_registry import SessionRegistry
     from marl_handover.hardware.settings import TWIN, HardwareConfig
 
     latch, twins = StopLatch(HardwareConfig().stop_path()), StopLatch(HardwareConfig(name=TWIN).stop_path())
@@ -187,9 +187,9 @@ def _arms() -> Iterator[str]:
         yield "no stop is latched"
     if twins.is_set():
         yield f"the twin's stop is latched ({twins.reason()}); allow motion again: marl-handover stop clear=true"
-    running = Roll().signed()
+    running = SessionRegistry().registered()
     yield f"sessions that run: {', '.join(f'process {session.pid}' for session in running) or 'none'}"
-    for session in Roll().others():
+    for session in SessionRegistry().others():
         certain = "runs one" if session.stop_file else "may run one"
         yield f"{session.owner} {certain} too, process {session.pid}: only {session.owner} can stop it"
 

@@ -13,7 +13,7 @@ from marl_handover.errors import InvalidSetting, WorkFailed
 from marl_handover.hardware.settings import HardwareConfig
 
 if TYPE_CHECKING:
-    from marl_handover.hardware.emulator.device import Device
+    from marl_handover.hardware.emulator.device import EmulatedDevice
 
 
 @dataclass
@@ -56,12 +56,11 @@ def run(config: EmulateConfig) -> int:
     return 0
 
 
-def _device(config: EmulateConfig) -> Device:
+def _device(config: EmulateConfig) -> EmulatedDevice:
     """The board that is asked for, with its servos where a lab puts the arms before switching on."""
     from marl_handover.cell.build import build_cell, cell_config
     from marl_handover.config import MotionConfig
-    from marl_handover.hardware.emulator.cell import EmulatedCell
-    from marl_handover.hardware.emulator.faults import parse_faults
+    from marl_handover.hardware.emulator.device import EmulatedCell, parse_faults
 
     require_seed(config.hardware.emulator.seed)
     require_choice("board", config.board, tuple(config.hardware.boards))

@@ -10,8 +10,8 @@ from pathlib import Path
 from marl_handover.commands.stop_now import REASON, Ordered, order
 from marl_handover.config import bounded, check_bounds
 from marl_handover.errors import InvalidSetting, WorkFailed
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.roll import Roll, Signed, suspended
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.session_registry import SessionRecord, SessionRegistry, suspended
 from marl_handover.hardware.settings import TWIN, HardwareConfig
 
 _POLL_S = 0.01
@@ -67,19 +67,19 @@ def run(config: StopCommand, ordered: Ordered | None = None) -> int:
 
 
 def _clear(paths: Sequence[Path], only: bool) -> int:
-    running = [] if only else [session.stop_file for session in Roll().signed() if session.stop_file]
+    running = [] if only else [session.stop_file for session in SessionRegistry().registered() if session.stop_file]
     for each in dict.fromkeys([*paths, *running]):
         StopLatch(each).clear()
         print(f"cleared {each}; arms may move again")
     return 0
 
 
-def _wait(running: Sequence[Signed], wait_s: float) -> list[str]:
+def _wait(running: Sequence[SessionRecord], wait_s: float) -> list[str]:
     """Wait until all have obeyed or signed off; what is wrong with those that have not."""
-    roll, waiting = Roll(), {session.entry: session for session in running}
+    registry, waiting = SessionRegistry(), {session.entry: session for session in running}
     end_s = time.monotonic() + wait_s
     while True:
-        now = {session.entry: session.obeyed for session in [*roll.signed(), *roll.others()]} if waiting else {}
+        now = {session.entry: session.obeyed for session in [*registry.registered(), *registry.others()]} if waiting else {}
         for entry in [entry for entry in waiting if now.get(entry, True)]:
             what = "has stopped its arms" if entry in now else "is over"
             print(f"{_called(waiting.pop(entry))} {what}", flush=True)
@@ -90,7 +90,7 @@ def _wait(running: Sequence[Signed], wait_s: float) -> list[str]:
         time.sleep(_POLL_S)
 
 
-def _called(session: Signed) -> str:
+def _called(session: SessionRecord) -> str:
     return f"process {session.pid}" + (f" of {session.owner}" if session.owner else "")
 
 
@@ -99,7 +99,7 @@ def _held(pid: int) -> str:
     return " (it is suspended: it stops its arms once it goes on)" if suspended(pid) else ""
 
 
-def _beyond(session: Signed) -> str:
+def _beyond(session: SessionRecord) -> str:
     """Words on a session that this user's stop does not reach."""
     who = session.owner
     how = f"only {who} can stop it here: sudo -u {who} marl-handover stop" if " " not in who else f"only {who} can stop it here"

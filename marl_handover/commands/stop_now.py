@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from marl_handover.hardware import roll as rolls
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.roll import Roll, Signed
+from marl_handover.hardware import session_registry
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.session_registry import SessionRecord, SessionRegistry
 
 REASON = "marl-handover stop"
 _PLAIN = {
@@ -28,8 +28,8 @@ class Ordered(NamedTuple):
     not be written.
     """
 
-    waiting: list[Signed]
-    beyond: list[Signed]
+    waiting: list[SessionRecord]
+    beyond: list[SessionRecord]
     troubles: list[str]
 
 
@@ -42,16 +42,16 @@ def at_once(arguments: Sequence[str]) -> Ordered | None:
             return None
         given[key] = value
     stop_file = given.get("hardware.stop_file", "")
-    return order(Path(stop_file) if stop_file else rolls.user_path(".stop"), given.get("reason", REASON), only=bool(stop_file))
+    return order(Path(stop_file) if stop_file else session_registry.user_path(".stop"), given.get("reason", REASON), only=bool(stop_file))
 
 
 def order(path: Path, reason: str, only: bool) -> Ordered:
     """Latch in ``path`` and, unless ``only`` that is asked for, in the stop file of every session of this user that runs."""
-    roll = Roll()
-    running = roll.signed(path if only else None)
+    registry = SessionRegistry()
+    running = registry.registered(path if only else None)
     paths = list(dict.fromkeys([path, *(session.stop_file for session in running if session.stop_file)]))
-    troubles = [trouble for each in paths if (trouble := _latched(StopLatch(each, roll), reason))]
-    others = roll.others()
+    troubles = [trouble for each in paths if (trouble := _latched(StopLatch(each, registry), reason))]
+    others = registry.others()
     reached = [session for session in others if session.stop_file in paths]
     return Ordered(running + reached, [] if only else [session for session in others if session not in reached], troubles)
 

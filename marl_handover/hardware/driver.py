@@ -1,4 +1,4 @@
-"""Both arms over one board or two: connect, configure, arm, move, park, disconnect. Every move passes the safety gate and the latched stop.
+"""Both arms over one board or two: connect, arm, move, park, disconnect. Every move passes the safety filter and the latched stop.
 
     with ArmDriver(config, model, confirm=ask) as driver:  # connects and configures
         driver.arm()
@@ -12,23 +12,36 @@ a supply that is too weak. A power switch in reach is no luxury: software cannot
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import TracebackType
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
+from marl_handover.hardware.board_group import Pulses, all_held, none_held, readback_middles
 from marl_handover.hardware.clock import Clock
-from marl_handover.hardware.commanded import SETTLED_S
-from marl_handover.hardware.errors import HalfHeld, NotConfirmed, WrongState
-from marl_handover.hardware.gate import JointCommand
-from marl_handover.hardware.held import Pulses, all_held, middles, none_held
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.moving import MovingSession, Sent
-from marl_handover.hardware.session import GATE_OFF, State
+from marl_handover.hardware.connection import FILTER_OFF, ArmConnection, State
+from marl_handover.hardware.errors import BadCommand, HalfHeld, NotConfirmed, WrongState
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.hardware.settings import ARMS, HardwareConfig
+from marl_handover.hardware.ssc32 import SETTLED_S, LineRecord
+
+Floats = NDArray[np.float64]
+
+
+class MoveRecord(NamedTuple):
+    """What went out: the lines, and the joints (5,) of each arm that their pulses, whole microseconds, stand for."""
+
+    lines: tuple[LineRecord, ...]
+    joints_rad: dict[int, Floats]
+    duration_s: float
+
 
 _RESTATED_S = 0.2
 """Time for moves of half a reading, to where arms are held already."""
@@ -44,7 +57,7 @@ _JUMP = (
 _NOMINAL = " NOT CALIBRATED: {}. With a horn one tooth off, 15 degrees, an arm jumps by that much: stay clear until it has moved."
 
 
-class ArmDriver(MovingSession):
+class ArmDriver(ArmConnection):
     """The arms of a cell.
 
     Args:
@@ -93,7 +106,7 @@ class ArmDriver(MovingSession):
         """
         self._leave(broken=sys.exc_info()[0] is not None)
 
-    def arm(self) -> Sent:
+    def arm(self) -> MoveRecord:
         """Make the first move of every channel: to the parked pose, after somebody confirmed that this is safe. It opens the fingers.
 
         A board that was just switched on jumps there at full speed, so that the arms have to stand there already. Boards that still put
@@ -101,7 +114,7 @@ class ArmDriver(MovingSession):
 
         Raises:
             NotConfirmed: nobody confirmed, or the settings refuse.
-            GateRejection: the parked pose is not allowed, or the way there is not clear; let the arms go limp and put them there.
+            CommandRejected: the parked pose is not allowed, or the way there is not clear; let the arms go limp and put them there.
             HalfHeld: only some channels have a pulse, and letting go did not help (a dry run lets nothing go).
             Stopped: somebody stopped the arms meanwhile.
             BoardReset: a board shows no pulse even after the move.
@@ -111,7 +124,7 @@ class ArmDriver(MovingSession):
             raise WrongState("arm", self.state, State.CONFIGURED)
         commands = [JointCommand(arm, self.parked_rad, self.motion.finger_travel_mm) for arm in range(len(ARMS))]
         with self._arming():
-            self.gate.check_stand(commands)
+            self.safety_filter.check_stand(commands)
             pulses = self._all_or_none()
             self._ask((_DRIVE if all_held(pulses) else _JUMP) + self._warning())
             sent = self._jump(commands) if none_held(pulses) else self._drive_parked(commands)
@@ -119,44 +132,125 @@ class ArmDriver(MovingSession):
                 self.check_pulses()
         return sent
 
-    def rejoin(self) -> None:
+    def move(self, commands: Sequence[JointCommand], duration_s: float, made_s: float | None = None) -> MoveRecord:
+        """Send arms somewhere together, in ``duration_s``; what was sent.
+
+        Args:
+            commands: one for each arm that is to move.
+            duration_s: a multiple of 20 ms is what boards do.
+            made_s: when the command was thought of; now unless given.
+
+        Raises:
+            CommandRejected: it must not be sent.
+            Stopped: the stop is latched; every channel was told to stop.
+            PulseMismatch: a board does not do what it is told; every channel was told to stop.
+            BoardReset, PortLost, BadReply: the electronics failed; the arms have to be armed again, or the port connected.
+        """
+        return self._move(commands, duration_s, made_s, State.ARMED)
+
+    def joints_rad(self) -> Floats:
+        """Where the arms have been sent to by now: (num_arms, 5); NaN for arms whose position is not known. Servos say nothing."""
+        now_s = self.clock.now_s()
+        rows = [None if self._safety_filter is None else self._safety_filter.held(arm, now_s) for arm in range(len(ARMS))]
+        return np.array([np.full(5, np.nan) if row is None else row[0] for row in rows])
+
+    def gripper_mm(self, arm: int) -> float:
+        """How far from closed each finger of an arm has been sent; NaN if that is not known."""
+        row = None if self._safety_filter is None else self._safety_filter.held(arm, self.clock.now_s())
+        return math.nan if row is None else row[1]
+
+    def drive(self, arm: int, joints_rad: Floats, gripper_mm: float, speed_deg_s: float) -> MoveRecord:
+        """Drive one arm straight in joint angles to ``joints_rad`` (5,), none faster than ``speed_deg_s``; what was sent.
+
+        Raises as :meth:`move`, and :class:`BadCommand` for a speed that is none; the arm then holds where it was sent last.
+        """
+        return self._drive([JointCommand(arm, joints_rad, gripper_mm)], speed_deg_s, State.ARMED)
+
+    def resync(self) -> None:
         """After a lost port: take the arms where the boards still hold them, and go on from there. Nobody has to be asked: nothing moves.
 
         Every channel is sent where it is, to 10 us, which is the first move that a board wants to see after a new connection.
 
         Raises:
             BoardReset: a board has forgotten its arms; they have to be armed.
-            GateRejection: it holds one outside its limits.
+            CommandRejected: it holds one outside its limits.
             Stopped: the stop is latched, or somebody stopped the arms meanwhile.
         """
         if self.state is not State.CONFIGURED:
-            raise WrongState("rejoin", self.state, State.CONFIGURED)
+            raise WrongState("resync", self.state, State.CONFIGURED)
         with self._arming():
             self._restate()
 
     def park(self) -> None:
         """Drive one arm after the other to the parked pose, slowly and straight in joint angles. Raises as :meth:`move`.
 
-        The gate watches table and arms, but knows nothing of a block in the way: it is for leaving, not for handing over.
+        The safety filter watches table and arms, but knows nothing of a block in the way: it is for leaving, not for handing over.
         """
         for arm in range(len(ARMS)):
             self.drive(arm, self.parked_rad, self.gripper_mm(arm), self.config.park_deg_s)
+
+    def _drive(self, commands: Sequence[JointCommand], speed_deg_s: float, needs: State) -> MoveRecord:
+        """Drive arms together, in short moves."""
+        if not (isinstance(speed_deg_s, int | float) and math.isfinite(speed_deg_s) and speed_deg_s > 0):
+            raise BadCommand("speed_deg_s", speed_deg_s, "a finite number above 0")
+        ways, step_s = {}, self.config.stream.period_s
+        slowest_s = 0.0
+        for command in commands:
+            target, held = self.safety_filter.target(command), self.safety_filter.held(command.arm, self.clock.now_s())
+            if held is None:
+                raise WrongState("drive", "the position is not known", State.ARMED)
+            start = np.append(*held)
+            change = np.abs(target - start)
+            slowest_s = max(slowest_s, math.degrees(change[:5].max()) / speed_deg_s, change[5] / self.config.gate.finger_mm_s)
+            ways[command.arm] = start, target
+        steps = max(1, math.ceil(slowest_s / step_s - 1e-9))
+        lines: list[LineRecord] = []
+        for number in range(1, steps + 1):
+            share = number / steps
+            rows = {arm: (1 - share) * start + share * target for arm, (start, target) in ways.items()}
+            sent = self._move([JointCommand(arm, row[:5], float(row[5])) for arm, row in rows.items()], step_s, None, needs)
+            lines += sent.lines
+            self.wait(step_s)
+        self.settle(SETTLED_S)
+        return MoveRecord(tuple(lines), sent.joints_rad, steps * step_s)
+
+    def _move(self, commands: Sequence[JointCommand], duration_s: float, made_s: float | None, needs: State) -> MoveRecord:
+        self._require(needs)
+        made = self.clock.now_s() if made_s is None else made_s
+        self.check_stop()
+        stream = self.config.stream
+        with self._watched():
+            if stream.check_reset:
+                # All of them: what one arm may do depends on where the other is, and that is known while its board holds it.
+                self.check_pulses()
+            while (backlog_s := self.boards.backlog_s(self.boards.by_name)) > stream.backlog_s:
+                self.wait(max(backlog_s - stream.backlog_s, stream.poll_s))
+            with self._allowed(needs):
+                self.safety_filter.check(commands, duration_s, self.clock.now_s(), made)
+                pulses = self.wiring.pulses(commands)
+                time_ms = max(1, round(1000 * duration_s))
+                lines = [self.boards.by_name[name].move(found, time_ms, self.wiring.speeds(name, found)) for name, found in pulses.items()]
+                self.safety_filter.accept(commands, duration_s, self.clock.now_s())
+        return MoveRecord(tuple(lines), self._stood_for(pulses, commands), duration_s)
+
+    def _stood_for(self, pulses: Mapping[str, Mapping[int, int]], commands: Sequence[JointCommand]) -> dict[int, Floats]:
+        return {command.arm: self.wiring.state(pulses, command.arm)[0] for command in commands}
 
     @contextlib.contextmanager
     def _arming(self) -> Iterator[None]:
         """Inside, the state is arming; then armed, unless something came in between."""
         with self._writing:
-            self.obey()
+            self.check_stop()
             self.state = State.ARMING
         try:
-            self.gate.forget()
+            self.safety_filter.forget()
             with self._watched():
                 yield
             with self._allowed(State.ARMING):
                 self.state = State.ARMED
         finally:
             if self.state is State.ARMING:
-                self.gate.forget()
+                self.safety_filter.forget()
                 self.state = State.CONFIGURED
 
     def _all_or_none(self) -> Pulses:
@@ -167,7 +261,7 @@ class ArmDriver(MovingSession):
         if not self.dry_run:
             self._ask(_LET_GO)
             with self._allowed(State.ARMING):
-                self.boards.limp()
+                self.boards.torque_off()
             pulses = self.boards.pulses()
         if not none_held(pulses):
             raise HalfHeld()
@@ -179,28 +273,30 @@ class ArmDriver(MovingSession):
             raise NotConfirmed()
 
     def _warning(self) -> str:
-        """Of arms that nobody has calibrated, and of a gate that is off."""
-        off = "" if self.config.gate.enabled else f" {GATE_OFF}."
+        """Of arms that nobody has calibrated, and of a safety filter that is off."""
+        off = "" if self.config.gate.enabled else f" {FILTER_OFF}."
         nominal = [calibration.arm for calibration in self.calibrations if calibration.measured_unix_s == 0.0]
         return off + (_NOMINAL.format(" and ".join(nominal)) if nominal else "")
 
-    def _jump(self, commands: Sequence[JointCommand]) -> Sent:
+    def _jump(self, commands: Sequence[JointCommand]) -> MoveRecord:
         """The first move of boards that know no position: they jump, whatever time they are given."""
         wanted, period_s = self.wiring.pulses(commands), self.config.stream.period_s
         with self._allowed(State.ARMING):
             lines = self.boards.first_move(wanted, round(1000 * period_s))
             for command in commands:
-                self.gate.refer(*command)
+                self.safety_filter.refer(*command)
         self.wait(period_s + self.config.stream.settle_s)
-        return Sent(lines, self._stood_for(wanted, commands), period_s)
+        return MoveRecord(lines, self._stood_for(wanted, commands), period_s)
 
-    def _drive_parked(self, commands: Sequence[JointCommand]) -> Sent:
-        """From where the boards hold the arms, in short moves that the gate sees, after a look at the whole ways.
+    def _drive_parked(self, commands: Sequence[JointCommand]) -> MoveRecord:
+        """From where the boards hold the arms, in short moves that the safety filter sees, after a look at the whole ways.
 
         Each arm's against all of the other's: boards do not tell when a servo is stuck, and then one arm moves by itself.
         """
         self._restate()
-        self.gate.check_room({command.arm: self.gate.target(command) for command in commands}, self.clock.now_s(), together=False)
+        self.safety_filter.check_room(
+            {command.arm: self.safety_filter.target(command) for command in commands}, self.clock.now_s(), together=False
+        )
         sent = self._drive(commands, self.config.park_deg_s, State.ARMING)
         self.wait(self.config.stream.settle_s)
         return sent
@@ -209,7 +305,7 @@ class ArmDriver(MovingSession):
         """Send every channel where it is held, and take it for where the arms are. A joint at its limit is not sent past it."""
         pulses = self.boards.pulses()
         stay = self._refer(pulses)
-        wanted, within = middles(pulses), self.wiring.pulses(stay)
+        wanted, within = readback_middles(pulses), self.wiring.pulses(stay)
         for wiring in self.config.arms.values():
             wanted[wiring.board].update({channel: within[wiring.board][channel] for channel in wiring.channels})
         with self._allowed(State.ARMING):
@@ -223,7 +319,7 @@ class ArmDriver(MovingSession):
             if self.state is State.ARMED and self.config.on_disconnect == "park":
                 self.park()
             elif self.state in (State.ARMED, State.STOPPED) and self.config.on_disconnect == "limp":
-                self.limp()
+                self.torque_off()
         except BaseException:
             self.halt()
             raise

@@ -41,7 +41,7 @@ class Unexplained(CalibrationProblem):
         self.off_mm = off_mm
 
 
-class Sighting(NamedTuple):
+class MarkerObservation(NamedTuple):
     """What a camera saw while an arm was sent to ``pulses_us`` (5,).
 
     ``seen_mm`` (2,) is a world position. With a camera's place it is where the ray through the point meets the plane z = ``plane_mm``, and
@@ -59,7 +59,7 @@ class Sighting(NamedTuple):
     came: tuple[float, ...] = (0.0,) * len(ARM_JOINTS)
 
 
-class Identified(NamedTuple):
+class SolvedCalibration(NamedTuple):
     """A calibration, and how sure it is.
 
     ``residual_mm`` is the sightings' root mean square residual, ``joint_sd_deg`` (5,) each joint's standard deviation in the middle of the
@@ -73,16 +73,16 @@ class Identified(NamedTuple):
     half_band_sd_us: Floats
 
 
-def identify(
+def solve_calibration(
     model: CellModel,
     before: ArmCalibration,
-    sightings: Sequence[Sighting],
+    sightings: Sequence[MarkerObservation],
     *,
     position_sd_mm: float = 1.5,
     yaw_sd_deg: float = 1.0,
     zero_sd_deg: float = 5.0,
     scale_sd: float = 0.05,
-) -> Identified:
+) -> SolvedCalibration:
     """The calibration that explains the sightings best.
 
     The dead band of a joint that the sightings say little about comes out near the arm's other joints'.
@@ -130,7 +130,7 @@ def identify(
     calibration = replace(before, maps=tuple(maps), measured_unix_s=time.time())
     residual_mm = float(np.sqrt((off_mm**2).sum(axis=1).mean()))
     half_us, sd_us = np.maximum(_USUAL_US + halves @ found.x, 0.0), np.sqrt(np.diag(halves @ covariance @ halves.T))
-    return Identified(calibration, residual_mm, np.degrees(np.sqrt(np.diag(covariance)[:5])), half_us, sd_us)
+    return SolvedCalibration(calibration, residual_mm, np.degrees(np.sqrt(np.diag(covariance)[:5])), half_us, sd_us)
 
 
 def _require_explained(arm: str, off_mm: Floats, success: bool, message: str) -> None:
@@ -148,7 +148,7 @@ def _lines(calibration: ArmCalibration) -> tuple[Floats, Floats]:
     return zeros, np.array([float(servo.to_us(1.0)) for servo in calibration.maps]) - zeros
 
 
-def _misses(model: CellModel, arm: int, joints_rad: Floats, sightings: Sequence[Sighting]) -> tuple[Floats, Floats]:
+def _misses(model: CellModel, arm: int, joints_rad: Floats, sightings: Sequence[MarkerObservation]) -> tuple[Floats, Floats]:
     """Predicted less seen: positions (n, 2) in mm, yaws (n,) in rad, 0 where none was seen."""
     base, T = model.cell.bases[arm], model.arm.fk(joints_rad)
     points = np.array([sighting.point_mm for sighting in sightings])

@@ -22,7 +22,6 @@ READING_US = 10
 
 SPEED_US_S = (1, 65535)
 TIME_MS = (1, 65535)
-OFFSET_US = (-100, 100)
 BAUDS = (115200, 38400, 9600, 2400)
 """Rates of the boards' jumpers or button; 9600 is what an SSC-32U comes with, 115200 is what stopping in time needs."""
 
@@ -36,9 +35,6 @@ CANCEL = ESC
 """Drops what was sent of the present line, so that a fresh start is not glued to an old fragment."""
 
 MAX_VERSION_BYTES = 64
-_DIGITAL = tuple("ABCDEF") + tuple(f"{letter}L" for letter in "ABCDEF")
-_ANALOG = tuple("ABCDEFGH")
-_VOLTS_PER_STEP = 5.0 / 256.0
 _FIRMWARE = re.compile(r"SSC32-V(\d+)\.(\d+)(\w*)")
 
 
@@ -52,14 +48,6 @@ class Move:
 
 
 @dataclass(frozen=True)
-class Offset:
-    """Shift everything a channel is told by ``offset_us``; forgotten at power-off, executed at full speed."""
-
-    channel: int
-    offset_us: int
-
-
-@dataclass(frozen=True)
 class Level:
     """Stop the pulses of a channel and hold its pin high or low. Low is how a servo is let go limp."""
 
@@ -67,7 +55,7 @@ class Level:
     high: bool
 
 
-Command = Move | Offset | Level
+BoardCommand = Move | Level
 
 
 @dataclass(frozen=True)
@@ -84,7 +72,7 @@ class Firmware:
         return self.number >= (2, 1)
 
 
-def encode_line(commands: Sequence[Command], time_ms: int | None = None) -> bytes:
+def encode_line(commands: Sequence[BoardCommand], time_ms: int | None = None) -> bytes:
     """One line for commands of one type; ``time_ms`` goes with moves only. Moves in one line begin and end together.
 
     Raises:
@@ -92,8 +80,8 @@ def encode_line(commands: Sequence[Command], time_ms: int | None = None) -> byte
         DuplicateChannel, MixedCommands, LineTooLong: as they say.
     """
     kinds = {type(command) for command in commands}
-    if not commands or not kinds <= {Move, Offset, Level}:
-        raise BadCommand("commands", [type(command).__name__ for command in commands], "at least one Move, Offset or Level")
+    if not commands or not kinds <= {Move, Level}:
+        raise BadCommand("commands", [type(command).__name__ for command in commands], "at least one Move or Level")
     if len(kinds) > 1:
         raise MixedCommands(kind.__name__ for kind in kinds)
     _require_distinct(command.channel for command in commands)
@@ -129,40 +117,6 @@ def query_pulses(channels: Sequence[int]) -> bytes:
     return _line("".join(f"QP{_channel(channel)}" for channel in channels))
 
 
-def byte_output(bank: int, value: int) -> bytes:
-    """Set the eight pins of a bank."""
-    return _line(f"#{_whole('bank', bank, 0, 3)}:{_whole('value', value, 0, 255)}")
-
-
-def read_digital(names: Sequence[str]) -> bytes:
-    """Ask for inputs ``A`` to ``F``, or latched ones ``AL`` to ``FL``; :func:`parse_digital` reads the reply."""
-    if not 1 <= len(names) <= 8 or not set(names) <= set(_DIGITAL):
-        raise BadCommand("names", list(names), f"one to eight of {', '.join(_DIGITAL)}")
-    return _line(" ".join(names))
-
-
-def read_analog(names: Sequence[str]) -> bytes:
-    """Ask for voltages at ``A`` to ``H``; :func:`parse_analog` reads the reply. The first reading of a pin after power-up is wrong."""
-    if not 1 <= len(names) <= 8 or not set(names) <= set(_ANALOG):
-        raise BadCommand("names", list(names), f"one to eight of {', '.join(_ANALOG)}")
-    return _line(" ".join(f"V{name}" for name in names))
-
-
-def read_register(register: int) -> bytes:
-    """Ask for a register; :func:`parse_register` reads the reply."""
-    return _line(f"R{_whole('register', register, 0, 255)}")
-
-
-def write_register(register: int, value: int) -> bytes:
-    """Write a register (EEPROM, 100,000 writes; read by the board at power-up only)."""
-    return _line(f"R{_whole('register', register, 0, 255)}={_whole('value', value, -32768, 65535)}")
-
-
-def restore_defaults() -> bytes:
-    """All registers to their defaults; the board answers ``OK`` and CR after a second or more."""
-    return _line("RDFLT")
-
-
 def parse_moving(reply: bytes) -> bool:
     """Whether the last move goes on, from the one byte that answers ``Q``."""
     if reply not in (b".", b"+"):
@@ -186,35 +140,11 @@ def parse_version(reply: bytes) -> Firmware:
     return Firmware(match[0], (int(match[1]), int(match[2])), match[3])
 
 
-def parse_digital(reply: bytes, count: int) -> tuple[bool, ...]:
-    """Levels of ``count`` inputs."""
-    if len(reply) != count or not set(reply) <= set(b"01"):
-        raise BadReply("inputs", reply, f"{count} of '0' and '1'")
-    return tuple(byte == ord("1") for byte in reply)
-
-
-def parse_analog(reply: bytes, count: int) -> tuple[float, ...]:
-    """Voltages in V of ``count`` inputs."""
-    if len(reply) != count:
-        raise BadReply("analog inputs", reply, f"{count} bytes")
-    return tuple(byte * _VOLTS_PER_STEP for byte in reply)
-
-
-def parse_register(reply: bytes) -> int:
-    """A register's value."""
-    text = reply.strip()
-    if not re.fullmatch(rb"-?\d{1,5}", text):
-        raise BadReply("R", reply, "a whole number and CR")
-    return int(text)
-
-
-def _encoded(command: Command) -> str:
+def _encoded(command: BoardCommand) -> str:
     head = f"#{_channel(command.channel)}"
     if isinstance(command, Move):
         speed = "" if command.speed_us_s is None else f"S{_whole('speed_us_s', command.speed_us_s, *SPEED_US_S)}"
         return f"{head}P{_whole('pulse_us', command.pulse_us, *PULSE_US)}{speed}"
-    if isinstance(command, Offset):
-        return f"{head}PO{_whole('offset_us', command.offset_us, *OFFSET_US)}"
     return head + ("H" if command.high else "L")
 
 

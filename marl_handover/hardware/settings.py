@@ -1,6 +1,6 @@
 """Settings of the arms' electronics, one home for each default; ``configs/hardware/*.yaml`` hold named differences.
 
-What is wired where, how a servo's pulse relates to its joint's angle before anything was measured, what the safety gate lets through,
+What is wired where, how a servo's pulse relates to its joint's angle before anything was measured, what the safety filter lets through,
 and what the emulated servos are like.
 """
 
@@ -14,7 +14,7 @@ from marl_handover.config import bounded, check_bounds, chosen, name_field, path
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.protocol import BAUDS, CHANNELS, PULSE_US
-from marl_handover.hardware.roll import user_path
+from marl_handover.hardware.session_registry import user_path
 
 FIRST_MOVES = ("ask", "refuse")
 ON_DISCONNECT = ("hold", "limp", "park")
@@ -78,8 +78,8 @@ def _nominal() -> dict[str, ServoNominal]:
 
 
 @dataclass
-class GateConfig:
-    """What the safety gate between plan and wire lets through. Planned motions keep more clearance (``motion.*``) than this."""
+class SafetyFilterConfig:
+    """What the safety filter between plan and wire lets through. Planned motions keep more clearance (``motion.*``) than this."""
 
     enabled: bool = True
     speed_share: float = bounded(1.0, 0.01, 1.0)  # of the URDF's joint velocities; plans use motion.velocity_share of them
@@ -143,7 +143,7 @@ class HardwareConfig:
         default_factory=lambda: {"left": ArmWiring(), "right": ArmWiring(channels=[16, 17, 18, 19, 21], gripper=GripperConfig(channel=20))}
     )
     nominal: dict[str, ServoNominal] = field(default_factory=_nominal)
-    gate: GateConfig = field(default_factory=GateConfig)
+    gate: SafetyFilterConfig = field(default_factory=SafetyFilterConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     emulator: EmulatorConfig = field(default_factory=EmulatorConfig)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.errors import Stalled
-from marl_handover.hardware.gate import JointCommand
+from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.motion.trajectory import Phase
 
 Floats = NDArray[np.float64]
@@ -29,7 +29,7 @@ SLACK_S = 0.01
 """A move may be written so long after it is due without the next one coming later: half a frame, and more than asking the boards takes."""
 
 
-class Streamed(NamedTuple):
+class PlaybackRecord(NamedTuple):
     """How a motion went: group moves sent, greatest lateness of one, and whether it was played to its end or called off."""
 
     moves: int
@@ -56,7 +56,7 @@ def stream(
     *,
     called_off: Callable[[], bool] | None = None,
     on_tick: Callable[[float], None] | None = None,
-) -> Streamed:
+) -> PlaybackRecord:
     """Play motions, all on one time axis, and wait until the servos have arrived.
 
     Args:
@@ -68,12 +68,12 @@ def stream(
     Raises:
         InvalidSetting: a motion does not begin where its arm is.
         Stalled: the host fell behind by more than ``stream.late_s``; the arms hold.
-        GateRejection, Stopped, PulseMismatch, BoardReset, PortLost, BadReply: as :meth:`ArmDriver.move`.
+        CommandRejected, Stopped, PulseMismatch, BoardReset, PortLost, BadReply: as :meth:`ArmDriver.move`.
     """
     settings, clock = driver.config.stream, driver.clock
     tracks = [_track(driver, arm, phases) for arm, phases in motions.items() if phases]
     if not tracks:
-        return Streamed(0, 0.0, True)
+        return PlaybackRecord(0, 0.0, True)
     begin_s, end_s = min(float(track.t_s[0]) for track in tracks), max(float(track.t_s[-1]) for track in tracks)
     due_s, moves, latest_s = clock.now_s(), 0, 0.0
     count = max(1, math.ceil((end_s - begin_s) / settings.period_s - 1e-9))
@@ -85,7 +85,7 @@ def stream(
             raise Stalled(late_s, settings.late_s)
         if called_off is not None and called_off():
             driver.settle(settings.period_s + settings.settle_s)
-            return Streamed(moves, latest_s, False)
+            return PlaybackRecord(moves, latest_s, False)
         t_s = begin_s + (number + 1) * settings.period_s
         driver.move([track.at(t_s) for track in tracks if track.t_s[0] < t_s < track.t_s[-1] + settings.period_s], settings.period_s)
         sent_s = clock.now_s()
@@ -94,7 +94,7 @@ def stream(
         if on_tick is not None:
             on_tick(min(t_s, end_s))
     driver.settle(settings.period_s + settings.settle_s)
-    return Streamed(moves, latest_s, True)
+    return PlaybackRecord(moves, latest_s, True)
 
 
 def _track(driver: ArmDriver, arm: int, phases: Sequence[Phase]) -> _Track:

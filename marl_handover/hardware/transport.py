@@ -1,4 +1,7 @@
-"""A serial port that cannot hang: every wait has an end, every failure is a :class:`PortLost`, every byte is in the log."""
+"""Serial ports: which there are, and one that is open.
+
+An open one cannot hang: every wait has an end, every failure is a :class:`PortLost`, every byte is in the log.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,19 @@ import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import serial
+from serial.tools import list_ports
 
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.errors import FlushFailed, PortLost, PortNotFound
-from marl_handover.hardware.ports import list_serial_ports
 from marl_handover.hardware.protocol import CANCEL
 from marl_handover.hardware.settings import TimeoutConfig
 
 BITS_PER_BYTE = 10
-ATTEND_S = 0.004
+WAIT_SLICE_S = 0.004
 """Nobody who waits for an answer is out of reach for longer."""
 
 _SCHEMES = "marl_handover.hardware.emulator"
@@ -105,12 +109,12 @@ class Wire:
         return max(0.0, self._free_s - self._clock.now_s())
 
     def ask(
-        self, question: bytes, size: int, *, until: bytes = b"", timeout_s: float | None = None, attend: Callable[[], object] | None = None
+        self, question: bytes, size: int, *, until: bytes = b"", timeout_s: float | None = None, on_wait: Callable[[], object] | None = None
     ) -> bytes:
         """Send a question and read what comes back: up to ``size`` bytes, up to the first ``until``, or whatever there is at the timeout.
 
-        What had come in before is thrown away: it answers nothing that was asked now. ``attend`` is called every :data:`ATTEND_S` while
-        the answer is waited for; what it raises ends the waiting.
+        What had come in before is thrown away: it answers nothing that was asked now. While the answer is waited for, ``on_wait`` is called
+        every :data:`WAIT_SLICE_S`; what it raises ends the waiting.
         """
         with self._asking, self._guarded("reading"):
             self._serial.reset_input_buffer()
@@ -121,26 +125,26 @@ class Wire:
                 left_s = end_s - self._clock.now_s()
                 if left_s <= 0:
                     break
-                self._serial.timeout = left_s if attend is None else min(left_s, ATTEND_S)
+                self._serial.timeout = left_s if on_wait is None else min(left_s, WAIT_SLICE_S)
                 reply += self._serial.read(1 if until else size - len(reply))
-                if attend is not None:
-                    attend()
+                if on_wait is not None:
+                    on_wait()
             if reply:
                 self.log.append(Logged(self._clock.now_s(), "<", bytes(reply)))
             return bytes(reply)
 
-    def drain(self, quiet_s: float, attend: Callable[[], object] | None = None) -> None:
-        """Throw away what comes in, until nothing has for ``quiet_s``, or a second has passed. ``attend``: as of :meth:`ask`."""
+    def drain(self, quiet_s: float, on_wait: Callable[[], object] | None = None) -> None:
+        """Throw away what comes in, until nothing has for ``quiet_s``, or a second has passed. ``on_wait``: as of :meth:`ask`."""
         with self._asking, self._guarded("reading"):
-            self._serial.timeout = quiet_s if attend is None else min(quiet_s, ATTEND_S)
+            self._serial.timeout = quiet_s if on_wait is None else min(quiet_s, WAIT_SLICE_S)
             now_s = self._clock.now_s()
             end_s, quiet_since_s = now_s + 1.0, now_s
             while now_s < end_s and now_s - quiet_since_s < quiet_s:
                 heard = self._serial.read(256)
                 now_s = self._clock.now_s()
                 quiet_since_s = now_s if heard else quiet_since_s
-                if attend is not None:
-                    attend()
+                if on_wait is not None:
+                    on_wait()
 
     def close(self) -> None:
         """Let the port go, whatever state it is in."""
@@ -153,3 +157,48 @@ class Wire:
             yield
         except _FAILURES as error:
             raise PortLost(self.port, what, " ".join(str(error).split())) from error
+
+
+FTDI = (0x0403, 0x6001)
+"""Vendor and product of the USB chip on an SSC-32U, and in most cables of an SSC-32."""
+
+_BY_ID = Path("/dev/serial/by-id")
+_USB_SERIAL = Path("/sys/bus/usb-serial/devices")
+
+
+class PortInfo(NamedTuple):
+    """A port: the name to use, what it says about itself, and whether its USB chip is of the kind the boards have."""
+
+    path: str
+    description: str
+    likely: bool
+
+
+def list_serial_ports() -> list[PortInfo]:
+    """All ports, likely ones first; nothing is opened."""
+    stable = {str(link.resolve()): str(link) for link in sorted(_BY_ID.glob("*"))} if _BY_ID.is_dir() else {}
+    found = [
+        PortInfo(stable.get(str(Path(port.device).resolve()), port.device), port.description or "", (port.vid, port.pid) == FTDI)
+        for port in list_ports.comports()
+    ]
+    return sorted(found, key=lambda port: (not port.likely, port.path))
+
+
+def choose_port(port: str) -> str:
+    """``port`` itself if it is set, else the one port that is likely a board's. Raises :class:`PortNotFound`."""
+    if port:
+        return port
+    ports = list_serial_ports()
+    likely = [found.path for found in ports if found.likely]
+    if len(likely) != 1:
+        reason = "none looks like a controller board" if not likely else "more than one could be the board"
+        raise PortNotFound("", reason, [found.path for found in ports])
+    return likely[0]
+
+
+def latency_ms(path: str) -> int | None:
+    """How long a USB serial chip keeps bytes back before it hands them over; None where the system does not say."""
+    try:
+        return int((_USB_SERIAL / Path(path).resolve().name / "latency_timer").read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None

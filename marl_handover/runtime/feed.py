@@ -15,8 +15,8 @@ import numpy as np
 
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, WorkFailed
 from marl_handover.files import open_bounded, read_bounded, write_whole
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.roll import Roll, Signed
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.session_registry import SessionRecord, SessionRegistry
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.parsing import parse_json
 from marl_handover.perception.calibration import Pixels
@@ -167,12 +167,12 @@ class Feed:
         told = Path(str((self._state or {}).get("stop_file") or HardwareConfig().stop_path()))
         return [told] if told in signed else [*signed, told]
 
-    def _signed(self) -> list[Signed]:
-        """The sessions of the state's process as they are on this user's roll."""
+    def _signed(self) -> list[SessionRecord]:
+        """The sessions of the state's process as they are on this user's registry."""
         state = self._state
         if state is None or not _here(state):
             return []
-        return [session for session in Roll().signed() if session.pid == state["pid"]]
+        return [session for session in SessionRegistry().registered() if session.pid == state["pid"]]
 
     def stop(self, reason: str) -> str:
         """Latch the stop: allowed whatever ``view_control`` says. What was done, for people.

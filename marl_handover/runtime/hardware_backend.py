@@ -20,7 +20,7 @@ from marl_handover.config import MotionConfig
 from marl_handover.envs.backends import Execution
 from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
 from marl_handover.errors import WorkFailed
-from marl_handover.hardware.latch import PrivateStop, StopLatch
+from marl_handover.hardware.estop import PrivateStop, StopLatch
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.motion.pick_place import timed_phases
 from marl_handover.motion.trajectory import LOADED_PHASES, Phase, PickPlacePaths

@@ -12,7 +12,7 @@ from marl_handover.errors import MissingFile
 from marl_handover.hardware.calibration import calibrations
 from marl_handover.hardware.clock import Clock, RealClock
 from marl_handover.hardware.driver import ArmDriver
-from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.perception.calibration import CameraCalibration
 from marl_handover.perception.camera import Camera

@@ -11,7 +11,7 @@ import numpy as np
 
 from marl_handover.arrays import wrap
 from marl_handover.config import require_choice
-from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware.emulator.device import make_fault
 from marl_handover.hardware.settings import ARMS
 from marl_handover.runtime.events import Event
 from marl_handover.runtime.session import GivenGoal

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.errors import InvalidSetting
+from marl_handover.hardware.connection import State
 from marl_handover.hardware.errors import (
     BadReply,
     BoardReset,
@@ -20,8 +21,7 @@ from marl_handover.hardware.errors import (
     Stopped,
     WrongState,
 )
-from marl_handover.hardware.gate import GateRejection
-from marl_handover.hardware.session import State
+from marl_handover.hardware.safety_filter import CommandRejected
 from marl_handover.hardware.streaming import stream
 from marl_handover.motion.trajectory import LOADED_PHASES, Phase
 from marl_handover.runtime.events import Event
@@ -123,7 +123,7 @@ class Mover:
                     return self._start_over()
             except (BadReply, Stalled) as failure:
                 self.log.add(Event.BAD_REPLY if isinstance(failure, BadReply) else Event.HOST_LATE, text=failure)
-            except (GateRejection, InvalidSetting) as refusal:
+            except (CommandRejected, InvalidSetting) as refusal:
                 self.log.add(Event.GATE_REFUSED, text=refusal)
                 return self._go_home(arm, aimed)
             rest = [_rest(aimed, self.reached_s, self.driver.joints_rad()[arm])]
@@ -153,7 +153,7 @@ class Mover:
             stream(self.driver, {arm: [back]}, on_tick=lambda t_s: None)
         except _FINAL:
             raise
-        except (GateRejection, DeviceError):
+        except (CommandRejected, DeviceError):
             return self._start_over() if self.driver.state is not State.ARMED else self._go_home(arm, [approach])
         return False
 
@@ -166,7 +166,7 @@ class Mover:
                     self.driver.reconnect()
                 self.driver.arm()
                 break
-            except (NotConfirmed, GateRejection, *_FINAL):
+            except (NotConfirmed, CommandRejected, *_FINAL):
                 raise
             except DeviceError:
                 if self.lab.clock.now_s() >= end_s:
@@ -183,8 +183,8 @@ class Mover:
         begun_s = self.lab.clock.now_s()
         self.driver.reconnect()
         try:
-            self.driver.rejoin()
-        except (BoardReset, BadReply, PortLost, GateRejection):
+            self.driver.resync()
+        except (BoardReset, BadReply, PortLost, CommandRejected):
             self.log.add(Event.CONTROLLER_RESET, text="after the port was lost")
             return False
         self.log.add(Event.RECOVERED, what=Event.SERIAL_LOST, after_s=self.lab.clock.now_s() - begun_s)
@@ -194,7 +194,7 @@ class Mover:
         """From the parked pose, into which somebody has put the arms. Always False: the motion was broken off."""
         begun_s = self.lab.clock.now_s()
         if self.driver.state is State.LOST and self._reconnect():
-            self.driver.limp()
+            self.driver.torque_off()
         self._arm()
         self.log.add(Event.RECOVERED, what=Event.CONTROLLER_RESET, after_s=self.lab.clock.now_s() - begun_s)
         return False
@@ -209,9 +209,9 @@ class Mover:
             self.play_out.lead_rad[arm] = 0.0
         except _FINAL:
             raise
-        except (GateRejection, DeviceError):
+        except (CommandRejected, DeviceError):
             if self.driver.state is State.ARMED:
-                self.driver.limp()
+                self.driver.torque_off()
             self._start_over()
         return False
 

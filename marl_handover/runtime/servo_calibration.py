@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from marl_handover.geometry.se3 import transform
 from marl_handover.hardware.calibration import ArmCalibration, CalibrationProblem
 from marl_handover.hardware.driver import ArmDriver
-from marl_handover.hardware.gate import GateRejection, JointCommand
-from marl_handover.hardware.identify import LEAST_SIGHTINGS, Sighting, identify
+from marl_handover.hardware.identify import LEAST_SIGHTINGS, MarkerObservation, solve_calibration
+from marl_handover.hardware.safety_filter import CommandRejected, JointCommand
 from marl_handover.hardware.settings import ARMS
 from marl_handover.perception.calibration import CameraCalibration, Pixels
 from marl_handover.perception.camera import Camera
@@ -97,9 +97,9 @@ class ServoCalibration:
 
         Raises:
             CalibrationProblem: the marker was seen too seldom, or no servo explains what was seen.
-            GateRejection, Stopped, BoardReset, PortLost, BadReply: as :meth:`ArmDriver.move`.
+            CommandRejected, Stopped, BoardReset, PortLost, BadReply: as :meth:`ArmDriver.move`.
         """
-        sightings: list[Sighting] = []
+        sightings: list[MarkerObservation] = []
         for posture in self._postures(arm):
             sightings += self._sight(arm, posture)
         self.driver.drive(arm, self.driver.parked_rad, self.driver.gripper_mm(arm), _SPEED_DEG_S)
@@ -108,17 +108,17 @@ class ServoCalibration:
                 ARMS[arm], f"the marker on its hand was seen in {len(sightings) // 4} of {self.count} postures; is it glued on, is it lit?"
             )
         before = self.driver.calibrations[arm]
-        found = identify(self.driver.model, before, sightings, position_sd_mm=_SIGHT_SD_MM, yaw_sd_deg=_YAW_SD_DEG)
+        found = solve_calibration(self.driver.model, before, sightings, position_sd_mm=_SIGHT_SD_MM, yaw_sd_deg=_YAW_SD_DEG)
         seen = len(sightings) // 4
         return Measured(found.calibration, found.half_band_us, found.half_band_sd_us, found.residual_mm, seen, found.joint_sd_deg)
 
-    def _sight(self, arm: int, posture: Posture) -> list[Sighting]:
+    def _sight(self, arm: int, posture: Posture) -> list[MarkerObservation]:
         """The four corners of the marker at a posture; none if it is not seen."""
         fingers = self.driver.gripper_mm(arm)
         try:
             for joints in (posture.joints_rad - posture.side * _SIDE_RAD, posture.joints_rad):
                 self.driver.drive(arm, joints, fingers, _SPEED_DEG_S)
-        except GateRejection:
+        except CommandRejected:
             return []
         self.driver.wait(_SETTLE_S)
         wiring = self.driver.config.arms[ARMS[arm]]
@@ -132,7 +132,7 @@ class ServoCalibration:
         way = np.sign([float(servo.to_us(1.0)) - float(servo.to_us(0.0)) for servo in self.driver.calibrations[arm].maps])
         came = tuple((posture.side * way).tolist())
         return [
-            Sighting(pulses, at, camera_mm=camera_mm, plane_mm=0.0, point_mm=_triple(corner), came=came)
+            MarkerObservation(pulses, at, camera_mm=camera_mm, plane_mm=0.0, point_mm=_triple(corner), came=came)
             for at, corner in zip(self.seen_by.on_plane(found.pixels, 0.0), self._corners_mm, strict=True)
         ]
 
@@ -166,8 +166,8 @@ class ServoCalibration:
     def _clear(self, arm: int, joints_rad: Floats) -> bool:
         """Whether an arm may go there straight from the parked pose."""
         try:
-            self.driver.gate.check_room({arm: joints_rad}, self.driver.clock.now_s())
-        except GateRejection:
+            self.driver.safety_filter.check_room({arm: joints_rad}, self.driver.clock.now_s())
+        except CommandRejected:
             return False
         return True
 

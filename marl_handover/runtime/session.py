@@ -143,7 +143,7 @@ class Session:
         if not self.desk.paused:
             return False
         self.log.add(Event.PAUSED)
-        self.desk.wait(self.backend.lab.driver.obey)
+        self.desk.wait(self.backend.lab.driver.check_stop)
         self._answer()
         self.log.add(Event.RESUMED)
         return True

@@ -16,8 +16,7 @@ from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.hardware.clock import VirtualClock
-from marl_handover.hardware.emulator.cell import EmulatedCell
-from marl_handover.hardware.emulator.faults import Fault
+from marl_handover.hardware.emulator.device import EmulatedCell, Fault
 from marl_handover.perception.boards import Sheet, marker_sheet
 from marl_handover.perception.calibration import Pixels, hung_camera
 from marl_handover.perception.camera import Frame, RenderedCamera

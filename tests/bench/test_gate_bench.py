@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
 import gate as bench
 
 from marl_handover.hardware.clearance import FAR_MM, alone_mm, arm_shapes, between_mm, still
-from marl_handover.hardware.gate import JointCommand
+from marl_handover.hardware.safety_filter import JointCommand
 
 
 @pytest.fixture(scope="module")

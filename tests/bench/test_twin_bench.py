@@ -19,7 +19,7 @@ import twin_work
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.hardware.driver import ArmDriver
-from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.estop import StopLatch
 from marl_handover.runtime.settings import twin_lab
 from marl_handover.runtime.twin import Twin
 
@@ -58,7 +58,7 @@ def test_an_ordinary_motion_is_within_limits_and_close_to_them_is_said(armed: An
     driver.drive(0, PARKED + np.radians([25.0, 0, 0, 0, 0]), driver.gripper_mm(0), 60.0)
     found = watch.taken()
     assert found["violations"] == {}
-    share = 60.0 / np.degrees(driver.gate.speed_rad_s[0])
+    share = 60.0 / np.degrees(driver.safety_filter.speed_rad_s[0])
     assert found["worst"]["sent speed, share"] == pytest.approx(share, rel=0.1)
     assert watch.taken()["worst"] == {}, "it begins anew"
 

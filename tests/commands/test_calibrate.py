@@ -15,8 +15,8 @@ from marl_handover.commands.person import Person, confirmed
 from marl_handover.config import MotionConfig
 from marl_handover.errors import WorkFailed
 from marl_handover.hardware.calibration import load_calibration, nominal_calibration
-from marl_handover.hardware.emulator.cell import EmulatedCell
-from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.emulator.device import EmulatedCell
+from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.settings import ARMS
 from marl_handover.perception.calibration import CameraCalibration, hung_camera
 from marl_handover.runtime.play import load_play

@@ -13,11 +13,11 @@ from packaging.requirements import Requirement
 
 from marl_handover.cli import main
 from marl_handover.commands import doctor
-from marl_handover.hardware import ports, roll, settings
-from marl_handover.hardware.emulator.board import Board
-from marl_handover.hardware.emulator.device import Device
+from marl_handover.hardware import session_registry, settings, transport
+from marl_handover.hardware.emulator.board import EmulatedBoard
+from marl_handover.hardware.emulator.device import EmulatedDevice
 from marl_handover.hardware.emulator.pty import PtyEmulator
-from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.estop import StopLatch
 from marl_handover.requirements import CORE, by_extra, name_of, requirements
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -52,7 +52,7 @@ def board(tmp_path):
     running = []
 
     def make(baud=115200):
-        emulator, over = PtyEmulator(Device(Board(), baud=baud), tmp_path / f"ssc32-{baud}"), threading.Event()
+        emulator, over = PtyEmulator(EmulatedDevice(EmulatedBoard(), baud=baud), tmp_path / f"ssc32-{baud}"), threading.Event()
         thread = threading.Thread(target=emulator.serve, args=(over.is_set,))
         thread.start()
         running.append((emulator, over, thread))
@@ -85,7 +85,7 @@ def test_a_port_that_is_not_there_or_in_use_is_said_to_be(board, tmp_path, capsy
 
 def test_ports_are_asked_only_if_that_is_wanted(board, monkeypatch, capsys):
     emulator = board()
-    monkeypatch.setattr(ports, "list_serial_ports", lambda: [ports.PortInfo(str(emulator.link), "FT232R", True)])
+    monkeypatch.setattr(transport, "list_serial_ports", lambda: [transport.PortInfo(str(emulator.link), "FT232R", True)])
     main(["doctor"])
     out = capsys.readouterr().out
     assert f"{emulator.link}  FT232R, may be a controller" in out
@@ -96,7 +96,7 @@ def test_ports_are_asked_only_if_that_is_wanted(board, monkeypatch, capsys):
 
 
 def test_the_latched_stop_and_running_sessions_are_named(tmp_path, monkeypatch, capsys):
-    for module in (roll, settings):
+    for module in (session_registry, settings):
         monkeypatch.setattr(module, "user_path", lambda suffix: tmp_path / f"user{suffix}")
     latch = StopLatch(settings.HardwareConfig().stop_path())
     latch.join()
@@ -113,8 +113,8 @@ def test_the_latched_stop_and_running_sessions_are_named(tmp_path, monkeypatch, 
 
 
 def test_the_latency_of_a_usb_chip(tmp_path, monkeypatch):
-    monkeypatch.setattr(ports, "_USB_SERIAL", tmp_path)
+    monkeypatch.setattr(transport, "_USB_SERIAL", tmp_path)
     (tmp_path / "ttyUSB7").mkdir()
     (tmp_path / "ttyUSB7" / "latency_timer").write_text("16\n")
-    assert ports.latency_ms("/dev/ttyUSB7") == 16
-    assert ports.latency_ms("/dev/ttyUSB8") is None
+    assert transport.latency_ms("/dev/ttyUSB7") == 16
+    assert transport.latency_ms("/dev/ttyUSB8") is None

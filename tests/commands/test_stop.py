@@ -18,21 +18,20 @@ import pytest
 
 from marl_handover.cli import main
 from marl_handover.commands.stop_now import at_once
-from marl_handover.hardware import roll as rolls
-from marl_handover.hardware import settings
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.roll import Roll
+from marl_handover.hardware import session_registry, settings
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.session_registry import SessionRegistry
 
 
 @pytest.fixture
-def own_roll(tmp_path, monkeypatch):
-    """A roll that no other test's session signs."""
-    for module in (rolls, settings):
+def own_session_registry(tmp_path, monkeypatch):
+    """A session registry that no other test's session is in."""
+    for module in (session_registry, settings):
         monkeypatch.setattr(module, "user_path", lambda suffix: tmp_path / f"user{suffix}")
-    return Roll()
+    return SessionRegistry()
 
 
-def test_stop_is_latched_and_cleared(own_roll, tmp_path, capsys):
+def test_stop_is_latched_and_cleared(own_session_registry, tmp_path, capsys):
     path = tmp_path / "stop"
     assert main(["stop", f"hardware.stop_file={path}", "reason=smoke", "wait_s=0"]) == 0
     assert "no session runs; if arms move, CUT THE POWER" in capsys.readouterr().out
@@ -58,7 +57,7 @@ def obeying(latch, after_s):
     return thread
 
 
-def test_every_session_has_to_obey(own_roll, tmp_path, capsys):
+def test_every_session_has_to_obey(own_session_registry, tmp_path, capsys):
     path = tmp_path / "stop"
     quick, slow = StopLatch(path), StopLatch(path)
     obeying(quick, 0.0)
@@ -77,7 +76,7 @@ def test_every_session_has_to_obey(own_roll, tmp_path, capsys):
     assert "CUT" not in capsys.readouterr().out
 
 
-def test_plain_stop_reaches_sessions_with_stop_files_of_their_own(own_roll, tmp_path, capsys):
+def test_plain_stop_reaches_sessions_with_stop_files_of_their_own(own_session_registry, tmp_path, capsys):
     lab = StopLatch(tmp_path / "lab" / "stop")
     (tmp_path / "lab").mkdir()
     obeying(lab, 0.0)
@@ -88,37 +87,37 @@ def test_plain_stop_reaches_sessions_with_stop_files_of_their_own(own_roll, tmp_
     lab.leave()
 
 
-def test_a_session_that_was_killed_is_not_waited_for(own_roll, tmp_path, capsys):
-    own_roll.folder.mkdir(mode=0o700)
-    (own_roll.folder / "4194305-0.json").write_text('{"pid": 4194305, "stop_file": "/tmp/x"}')  # above the kernel's largest pid
-    (own_roll.folder / "rubbish.json").write_text("{")
+def test_a_session_that_was_killed_is_not_waited_for(own_session_registry, tmp_path, capsys):
+    own_session_registry.folder.mkdir(mode=0o700)
+    (own_session_registry.folder / "4194305-0.json").write_text('{"pid": 4194305, "stop_file": "/tmp/x"}')  # above the kernel's largest pid
+    (own_session_registry.folder / "rubbish.json").write_text("{")
     assert main(["stop", f"hardware.stop_file={tmp_path / 'stop'}"]) == 0
     assert main(["stop"]) == 0
-    assert not list(own_roll.folder.iterdir())
+    assert not list(own_session_registry.folder.iterdir())
 
 
-def test_a_stop_file_that_cannot_be_written_is_told_with_what_to_do(own_roll, tmp_path, capsys):
+def test_a_stop_file_that_cannot_be_written_is_told_with_what_to_do(own_session_registry, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert main(["stop", f"hardware.stop_file={tmp_path / 'file' / 'stop'}"]) == 1
     assert "CUT THE POWER" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("key", "word"), [("wait_s=-1", "wait_s"), ("hardware.stop_file=here", "absolute")])
-def test_bad_keys_are_refused(own_roll, tmp_path, capsys, key, word):
+def test_bad_keys_are_refused(own_session_registry, tmp_path, capsys, key, word):
     assert main(["stop", key]) == 2
     assert word in capsys.readouterr().err
 
 
 MEASURED = """
 import resource, sys
-from marl_handover.hardware import latch
-put = latch._put
+from marl_handover.hardware import estop
+put = estop._put
 def noted(path, text):
     put(path, text)
     used = resource.getrusage(resource.RUSAGE_SELF)
     heavy = {"numpy", "hydra", "omegaconf", "numba", "gymnasium", "torch", "scipy", "tqdm", "importlib.metadata"} & set(sys.modules)
     print("latched after", used.ru_utime + used.ru_stime, *sorted(heavy))
-latch._put = noted
+estop._put = noted
 from marl_handover.cli import main
 sys.exit(main(["stop", *sys.argv[1:]]))
 """
@@ -149,13 +148,13 @@ def test_the_stop_is_latched_before_anything_heavy_is_imported(tmp_path):
         ["clear=no"],
     ],
 )
-def test_what_has_to_be_read_first_is_not_latched_at_once(own_roll, tmp_path, arguments):
+def test_what_has_to_be_read_first_is_not_latched_at_once(own_session_registry, tmp_path, arguments):
     assert at_once(arguments) is None
     assert not (tmp_path / "user.stop").exists()
 
 
 @pytest.mark.parametrize("arguments", [["now"], ["resaon=x"], ["wait_s=never"], ["reason=x", "hardware.gate=1"]])
-def test_what_cannot_be_read_is_refused_and_latches_nothing(own_roll, tmp_path, capsys, arguments):
+def test_what_cannot_be_read_is_refused_and_latches_nothing(own_session_registry, tmp_path, capsys, arguments):
     assert main(["stop", *arguments]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "user.stop").exists()
@@ -164,7 +163,7 @@ def test_what_cannot_be_read_is_refused_and_latches_nothing(own_roll, tmp_path, 
 @pytest.mark.parametrize(
     "arguments", [[], ["reason=arm hits = table"], ["reason='quoted'"], ["debug=false", "clear=false"], ["hardware=lynxmotion"]]
 )
-def test_both_ways_to_the_latch_do_the_same(own_roll, tmp_path, capsys, arguments):
+def test_both_ways_to_the_latch_do_the_same(own_session_registry, tmp_path, capsys, arguments):
     obeying(latch := StopLatch(tmp_path / "lab.stop"), 0.0)
     assert main(["stop", "wait_s=20", *arguments]) == 0
     told = capsys.readouterr().out.splitlines()
@@ -175,7 +174,7 @@ def test_both_ways_to_the_latch_do_the_same(own_roll, tmp_path, capsys, argument
     latch.leave()
 
 
-def test_clearing_clears_the_twins_stop_too(own_roll, tmp_path, capsys):
+def test_clearing_clears_the_twins_stop_too(own_session_registry, tmp_path, capsys):
     twins = StopLatch(settings.HardwareConfig(name="twin").stop_path())
     obeying(twins, 0.0)
     assert main(["stop", "wait_s=20"]) == 0
@@ -187,7 +186,7 @@ def test_clearing_clears_the_twins_stop_too(own_roll, tmp_path, capsys):
     assert not twins.is_set(), "no twin runs, so none is stopped"
 
 
-def test_a_stop_file_of_somebody_else_is_named_when_it_cannot_be_cleared(own_roll, tmp_path, capsys):
+def test_a_stop_file_of_somebody_else_is_named_when_it_cannot_be_cleared(own_session_registry, tmp_path, capsys):
     (tmp_path / "user.stop").mkdir()
     assert main(["stop", "clear=true"]) == 1
     assert "whoever put it there, or root" in capsys.readouterr().err
@@ -197,9 +196,9 @@ def test_a_stop_file_of_somebody_else_is_named_when_it_cannot_be_cleared(own_rol
 SESSION = """
 import sys, time
 from pathlib import Path
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.roll import Roll
-latch = StopLatch(sys.argv[1], Roll(Path(sys.argv[2])))
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.session_registry import SessionRegistry
+latch = StopLatch(sys.argv[1], SessionRegistry(Path(sys.argv[2])))
 latch.join()
 print("on", flush=True)
 end_s = time.monotonic() + 60
@@ -211,9 +210,9 @@ time.sleep(60)
 """
 
 
-def test_a_session_that_is_suspended_is_named_and_stops_once_it_goes_on(own_roll, tmp_path, capsys):
+def test_a_session_that_is_suspended_is_named_and_stops_once_it_goes_on(own_session_registry, tmp_path, capsys):
     path = tmp_path / "stop"
-    process = subprocess.Popen([sys.executable, "-c", SESSION, path, own_roll.folder], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([sys.executable, "-c", SESSION, path, own_session_registry.folder], stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout.readline() == "on\n"
         process.send_signal(signal.SIGSTOP)
@@ -235,9 +234,9 @@ AS_SOMEBODY = """
 import contextlib, io, os, sys
 from pathlib import Path
 from marl_handover import cli
-from marl_handover.hardware import latch, roll, settings
+from marl_handover.hardware import estop, session_registry, settings
 base = Path(sys.argv[1])
-for module in (roll, settings, latch):
+for module in (session_registry, settings, estop):
     module.user_path = lambda suffix: base / f"marl-handover-{os.getuid()}{suffix}"
 with contextlib.redirect_stdout(io.StringIO()):
     cli.main(["stop", "--help"])  # imports what this user may read and the other may not
@@ -250,7 +249,7 @@ sys.exit(cli.main(["stop", *sys.argv[3:]]))
 
 @pytest.fixture
 def somebody():
-    """Another user with a process and a roll; ``stop(*arguments, uid=...)`` as a third user, who may read it or not."""
+    """Another user with a process and a session registry; ``stop(*arguments, uid=...)`` as a third user, who may read it or not."""
     if os.getuid() != 0:
         pytest.skip("needs root, to be other users")
     base = Path(tempfile.mkdtemp(prefix="marl-test-"))  # pytest's own folders are closed to others

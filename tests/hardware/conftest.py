@@ -12,9 +12,8 @@ from marl_handover.cell.build import CellModel, build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.driver import ArmDriver
-from marl_handover.hardware.emulator.cell import EmulatedCell
-from marl_handover.hardware.emulator.faults import parse_faults
-from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.emulator.device import EmulatedCell, parse_faults
+from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.settings import ArmWiring, BoardConfig, GripperConfig, HardwareConfig
 from marl_handover.motion.planner import MotionPlanner
 

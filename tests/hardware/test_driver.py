@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from marl_handover.hardware.connection import State
 from marl_handover.hardware.driver import ArmDriver
-from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware.emulator.device import make_fault
 from marl_handover.hardware.errors import BadReply, BoardReset, BoardSilent, NotConfirmed, PortLost, PortNotFound, Stopped, WrongState
-from marl_handover.hardware.gate import GateRejection, JointCommand, Reason
-from marl_handover.hardware.session import State
+from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason
 from marl_handover.hardware.settings import ARMS
 
 
@@ -29,7 +29,7 @@ def test_the_life_of_a_session(rig, wired):
     made = rig(wired)
     driver = made.driver
     assert driver.state is State.DISCONNECTED
-    for step in (driver.configure, driver.arm, lambda: driver.gate, lambda: driver.wiring, driver.resume):
+    for step in (driver.configure, driver.arm, lambda: driver.safety_filter, lambda: driver.wiring, driver.resume):
         with pytest.raises(WrongState):
             step()
     with driver:
@@ -124,10 +124,10 @@ def test_it_does_not_park_through_the_other_arm(armed, model):
     rig = armed()
     driver = rig.driver
     q = np.asarray(model.arm.ik([200.0, 0.0, 60.0])[0])
-    driver.gate.refer(0, q, 12.0)
-    driver.gate.refer(1, q, 12.0)
-    with pytest.raises(GateRejection) as caught:
-        driver.gate.check_room(dict.fromkeys((0, 1), driver.parked_rad), 0.0)
+    driver.safety_filter.refer(0, q, 12.0)
+    driver.safety_filter.refer(1, q, 12.0)
+    with pytest.raises(CommandRejected) as caught:
+        driver.safety_filter.check_room(dict.fromkeys((0, 1), driver.parked_rad), 0.0)
     assert caught.value.reason is Reason.OTHER_ARM
 
 
@@ -254,7 +254,7 @@ def test_on_leaving_the_settings_say_what_becomes_of_the_arms(rig, one_board, po
 
 def test_letting_go_and_arming_again(armed):
     rig = armed()
-    rig.driver.limp()
+    rig.driver.torque_off()
     rig.clock.sleep_s(0.1)
     assert not any(outputs(rig)["main"])
     with pytest.raises(WrongState):
@@ -283,7 +283,7 @@ def test_a_dry_run_does_all_but_the_last_write(armed):
     sent = rig.driver.move([turned(rig.driver, 5.0)], 0.06)
     assert sent.lines[0].data.startswith(b"#0P1547S")
     assert not sent.lines[0].written
-    with pytest.raises(GateRejection):
+    with pytest.raises(CommandRejected):
         rig.driver.move([turned(rig.driver, 50.0)], 0.06)
     rig.driver.wait(0.1)
     assert math.degrees(rig.driver.joints_rad()[0, 0]) == pytest.approx(5.0)

@@ -12,12 +12,9 @@ from hypothesis import strategies as st
 
 from marl_handover.errors import BadOverride, UnknownChoice
 from marl_handover.hardware.clock import VirtualClock
-from marl_handover.hardware.emulator.board import Board
-from marl_handover.hardware.emulator.cell import EmulatedCell
-from marl_handover.hardware.emulator.device import Device
-from marl_handover.hardware.emulator.faults import Fault, make_fault, parse_faults
+from marl_handover.hardware.emulator.board import EmulatedBoard, Servo, ServoTruth
+from marl_handover.hardware.emulator.device import EmulatedCell, EmulatedDevice, Fault, make_fault, parse_faults
 from marl_handover.hardware.emulator.protocol_ssc32emu import mount, unmount
-from marl_handover.hardware.emulator.servo import Servo, ServoTruth
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.hardware.ssc32 import Ssc32  # noqa: F401  # registers the URL scheme
 
@@ -70,7 +67,7 @@ def test_following_in_small_steps_is_following(start, goal, parts):
 
 
 def test_bytes_take_their_time_both_ways():
-    device = Device(Board(), baud=9600)
+    device = EmulatedDevice(EmulatedBoard(), baud=9600)
     device.host_baud = 9600
     device.write(b"VER\r", 1.0)
     arrived_s = 1.0 + 4 * 10 / 9600
@@ -83,7 +80,7 @@ def test_bytes_take_their_time_both_ways():
 
 
 def test_at_the_wrong_rate_nobody_understands_anybody():
-    device = Device(Board(), baud=115200)
+    device = EmulatedDevice(EmulatedBoard(), baud=115200)
     device.host_baud = 9600
     for _ in range(20):
         device.write(b"VER\r", device.sending_until_s())
@@ -114,7 +111,7 @@ def test_faults_that_make_no_sense_are_refused():
 
 
 def test_a_brown_out_forgets_everything_and_takes_its_time():
-    device = Device(Board(), {0: Servo(TRUTH, 0.3)}, boot_s=0.2)
+    device = EmulatedDevice(EmulatedBoard(), {0: Servo(TRUTH, 0.3)}, boot_s=0.2)
     device.write(b"#0P1600\r", 0.1)
     device.advance(1.0)
     stood = device.servos[0].position
@@ -129,7 +126,7 @@ def test_a_brown_out_forgets_everything_and_takes_its_time():
 
 
 def test_power_is_off_while_any_fault_takes_it():
-    device = Device(Board(), boot_s=0.1)
+    device = EmulatedDevice(EmulatedBoard(), boot_s=0.1)
     device.add_faults(parse_faults("silent@1:3,brownout@2:0.5"))
     powered = []
     for t_s in (0.9, 1.1, 2.7, 4.05, 4.15):
@@ -142,7 +139,7 @@ def test_power_is_off_while_any_fault_takes_it():
     ("fault", "reply"), [("drop@0", b""), ("stuck@0", b"+"), ("late@0=0.5", b""), ("silent@0", b""), ("jam@0", b"."), ("drop@0=0", b".")]
 )
 def test_faults_of_the_replies(fault, reply):
-    device = Device(Board())
+    device = EmulatedDevice(EmulatedBoard())
     device.add_faults(parse_faults(fault))
     device.write(b"Q\r", 1.0)
     assert device.read(1.1) == reply
@@ -150,7 +147,7 @@ def test_faults_of_the_replies(fault, reply):
 
 def test_corrupt_replies_are_wrong_and_repeatable():
     def heard(seed):
-        device = Device(Board(), seed=seed)
+        device = EmulatedDevice(EmulatedBoard(), seed=seed)
         device.add_faults(parse_faults("corrupt@0=1"))
         device.write(b"VER\r", 1.0)
         return device.read(2.0)
@@ -163,7 +160,7 @@ def test_corrupt_replies_are_wrong_and_repeatable():
 def port():
     """A pyserial port to a mounted device, in virtual time."""
     clock = VirtualClock()
-    device = Device(Board())
+    device = EmulatedDevice(EmulatedBoard())
     ports = []
 
     def make(faults="", **settings):
@@ -237,7 +234,7 @@ def test_a_full_buffer_makes_writes_wait_and_then_fail(port):
 @given(st.lists(st.tuples(st.binary(min_size=1, max_size=60), st.floats(0, 0.1)), max_size=10))
 def test_no_byte_overtakes_another(pieces):
     """What arrives is what was sent, in order, whatever the pauses."""
-    device, now_s = Device(Board()), 0.0
+    device, now_s = EmulatedDevice(EmulatedBoard()), 0.0
     for data, pause_s in pieces:
         now_s += pause_s
         device.write(data.replace(b"\r", b"") + b"\r", now_s)

@@ -13,14 +13,14 @@ from marl_handover.commands import emulate
 from marl_handover.compose import compose, from_text, to_yaml
 from marl_handover.config import BlockConfig
 from marl_handover.errors import HandoverError, InvalidSetting, UnknownChoice
+from marl_handover.hardware.board_group import Wiring, finger_mm, gripper_pulse_us
 from marl_handover.hardware.calibration import nominal_calibration
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.errors import PortNotFound
-from marl_handover.hardware.gate import JointCommand
-from marl_handover.hardware.ports import choose_port, list_serial_ports
+from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.hardware.settings import ARMS, GripperConfig, HardwareConfig
-from marl_handover.hardware.wiring import Wiring, finger_mm, gripper_pulse_us
+from marl_handover.hardware.transport import choose_port, list_serial_ports
 from marl_handover.resources import resource_path
 
 FILES = sorted(resource_path("configs/hardware").glob("*.yaml"))
@@ -147,8 +147,8 @@ def test_a_gate_that_is_off_is_said_at_every_start_and_before_the_first_move(rig
         with made.driver as driver:
             driver.arm()
         assert [record.levelname for record in caplog.records] == ["WARNING"]
-        assert "THE SAFETY GATE IS OFF (hardware.gate.enabled=false)" in caplog.text
-        assert "THE SAFETY GATE IS OFF" in asked[0]
+        assert "THE SAFETY FILTER IS OFF (hardware.gate.enabled=false)" in caplog.text
+        assert "THE SAFETY FILTER IS OFF" in asked[0]
 
 
 def test_a_gate_that_is_on_is_not_spoken_of(armed, caplog):

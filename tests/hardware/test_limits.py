@@ -19,10 +19,10 @@ from marl_handover.geometry.capsules import capsule_pairs, ground_clearance_mm, 
 from marl_handover.geometry.se3 import transform
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.emulator.board import FRAME_S
-from marl_handover.hardware.gate import GateRejection, JointCommand, Reason
+from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason
 from marl_handover.hardware.settings import ARMS
 
-EXPLAINED = re.compile(r"safety gate \((?P<reason>[a-z ]+)\): .+ is .+; allowed: .+", re.DOTALL)
+EXPLAINED = re.compile(r"safety filter \((?P<reason>[a-z ]+)\): .+ is .+; allowed: .+", re.DOTALL)
 BASE_YAW_US = (900, 2100)
 """Pulse limits of the left base, narrower than the joint's own."""
 
@@ -185,7 +185,7 @@ class Playground:
         pulses = driver.wiring.pulses([JointCommand(arm, joints[arm], 12.0) for arm in range(2)])["main"]
         device.write("".join(f"#{channel}P{pulse}" for channel, pulse in pulses.items()).encode() + b"\r", clock.now_s())
         clock.sleep_s(2 * FRAME_S)
-        driver.rejoin()
+        driver.resync()
 
     def _give(self, command, aims):
         """Give one command to the driver; how long to wait before the next."""
@@ -203,7 +203,7 @@ class Playground:
         try:
             driver.move(given, duration_s, clock.now_s() - age_s)
             self.sent += 1
-        except GateRejection as rejection:
+        except CommandRejected as rejection:
             log = driver.boards.by_name["main"].log[before:]
             self._refused(rejection, [entry.data for entry in log if entry.direction == ">"])
         return pause_s

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from marl_handover.errors import HandoverError
-from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware.connection import State
+from marl_handover.hardware.emulator.device import make_fault
 from marl_handover.hardware.errors import BadCommand, BoardReset
-from marl_handover.hardware.gate import GateRejection, JointCommand, Reason
-from marl_handover.hardware.session import State
+from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason
 
 
 def turned(driver, degrees, arm=0):
@@ -45,7 +45,7 @@ def test_what_is_no_command_is_refused_by_name(armed, one_board, enabled, arm, d
     one_board.gate.enabled = enabled
     rig = armed(one_board)
     before = lines(rig)
-    with pytest.raises(GateRejection) as caught:
+    with pytest.raises(CommandRejected) as caught:
         rig.driver.move([JointCommand(arm, rig.driver.parked_rad, 12.0)], duration, made)
     assert caught.value.reason in (Reason.SHAPE, Reason.DURATION)
     assert lines(rig) == before
@@ -72,7 +72,7 @@ def test_nor_is_an_arm_driven_to_what_is_no_place(armed, one_board, enabled, joi
     one_board.gate.enabled = enabled
     rig = armed(one_board)
     before = lines(rig)
-    with pytest.raises((GateRejection, BadCommand)):
+    with pytest.raises((CommandRejected, BadCommand)):
         rig.driver.drive(0, rig.driver.parked_rad if joints == "park" else joints, fingers, speed)
     assert lines(rig) == before
     with pytest.raises(HandoverError):

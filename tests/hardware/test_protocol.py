@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from marl_handover.hardware import protocol
 from marl_handover.hardware.errors import BadCommand, BadReply, DuplicateChannel, LineTooLong, MixedCommands
-from marl_handover.hardware.protocol import Level, Move, Offset
+from marl_handover.hardware.protocol import Level, Move
 
 channels = st.integers(0, 31)
 pulses = st.integers(500, 2500)
@@ -25,17 +25,10 @@ pulses = st.integers(500, 2500)
         (protocol.group_move({5: 1600}, None, {5: 750}), b"#5P1600S750\r"),
         (protocol.group_move({5: 1600, 10: 750}, 2500), b"#5P1600#10P750T2500\r"),
         (protocol.group_move({5: 1600, 17: 750}, 2500, {17: 500}), b"#5P1600#17P750S500T2500\r"),
-        (protocol.encode_line([Offset(2, -100), Offset(3, 17)]), b"#2PO-100#3PO17\r"),
         (protocol.encode_line([Level(3, True), Level(4, False)]), b"#3H#4L\r"),
-        (protocol.byte_output(3, 123), b"#3:123\r"),
         (protocol.stop([0, 31]), b"\x1bSTOP0\rSTOP31\r"),
         (protocol.query_pulses([5]), b"QP5\r"),
         (protocol.query_pulses([0, 16]), b"QP0QP16\r"),
-        (protocol.read_digital(["A", "BL"]), b"A BL\r"),
-        (protocol.read_analog(["C"]), b"VC\r"),
-        (protocol.read_register(4), b"R4\r"),
-        (protocol.write_register(32, -50), b"R32=-50\r"),
-        (protocol.restore_defaults(), b"RDFLT\r"),
         (protocol.QUERY, b"Q\r"),
         (protocol.VERSION, b"VER\r"),
     ],
@@ -68,12 +61,9 @@ def test_whole_numbers_of_numpy_are_whole_numbers():
         (lambda: protocol.group_move({0: 1500}, 65536), "time_ms"),
         (lambda: protocol.group_move({0: 1500}, math.nan), "time_ms"),
         (lambda: protocol.group_move({0: 1500}, 100, {0: 0}), "speed_us_s"),
-        (lambda: protocol.encode_line([Offset(0, 101)]), "offset_us"),
-        (lambda: protocol.encode_line([Offset(0, 1)], 100), "time_ms"),
+        (lambda: protocol.encode_line([Level(0, True)], 100), "time_ms"),
         (lambda: protocol.encode_line([]), "commands"),
         (lambda: protocol.encode_line(["#0P1500"]), "commands"),
-        (lambda: protocol.byte_output(4, 0), "bank"),
-        (lambda: protocol.read_digital(["G"]), "names"),
         (lambda: protocol.query_pulses([]), "channels"),
     ],
 )
@@ -101,9 +91,6 @@ def test_replies():
     assert not protocol.parse_moving(b".")
     assert protocol.parse_pulses(b"\x96\x00\xfa", 3) == (1500, None, 2500)
     assert protocol.parse_version(b"SSC32-V2.50USB\r") == protocol.Firmware("SSC32-V2.50USB", (2, 50), "USB")
-    assert protocol.parse_digital(b"01", 2) == (False, True)
-    assert protocol.parse_analog(b"\x80", 1) == (2.5,)
-    assert protocol.parse_register(b"-50\r") == -50
 
 
 @pytest.mark.parametrize(("firmware", "stops"), [("SSC32-V1.06XE", False), ("SSC32-V2.00XE", False), ("SSC32-V2.01XE_BETA1", True)])
@@ -123,8 +110,6 @@ def test_firmware_before_2_01_has_no_stop(firmware, stops):
         lambda: protocol.parse_pulses(b"\r", 1),
         lambda: protocol.parse_version(b"LSS-V2.50\r"),
         lambda: protocol.parse_version(b""),
-        lambda: protocol.parse_register(b"OK\r"),
-        lambda: protocol.parse_digital(b"2", 1),
     ],
 )
 def test_what_cannot_be_the_answer_is_refused(call):
@@ -152,9 +137,7 @@ def test_parsers_answer_or_refuse_whatever_comes(reply, count):
     for parse in (
         protocol.parse_moving,
         protocol.parse_version,
-        protocol.parse_register,
         lambda data: protocol.parse_pulses(data, count),
-        lambda data: protocol.parse_digital(data, count),
     ):
         with suppress(BadReply):
             parse(reply)

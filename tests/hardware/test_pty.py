@@ -14,16 +14,14 @@ import pytest
 
 from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.clock import RealClock
+from marl_handover.hardware.connection import State
 from marl_handover.hardware.driver import ArmDriver
-from marl_handover.hardware.emulator.board import Board
-from marl_handover.hardware.emulator.cell import EmulatedCell
-from marl_handover.hardware.emulator.device import Device
-from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware.emulator.board import EmulatedBoard
+from marl_handover.hardware.emulator.device import EmulatedCell, EmulatedDevice, make_fault
 from marl_handover.hardware.emulator.pty import PtyEmulator
 from marl_handover.hardware.errors import PortLost, Stopped
-from marl_handover.hardware.gate import JointCommand
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.session import State
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.hardware.settings import BoardConfig, HardwareConfig, TimeoutConfig
 from marl_handover.hardware.ssc32 import Ssc32
 
@@ -106,7 +104,7 @@ def test_a_cable_that_came_out_in_a_pause(served, model, tmp_path):
 
 
 def test_a_pty_is_paced_and_its_rate_counts(served, tmp_path):
-    served(Device(Board(), baud=9600), tmp_path / "port")
+    served(EmulatedDevice(EmulatedBoard(), baud=9600), tmp_path / "port")
     board = Ssc32("main", BoardConfig(str(tmp_path / "port"), baud=115200), TimeoutConfig(), RealClock())
     board.connect()
     assert board.wire.baud == 9600
@@ -117,7 +115,7 @@ def test_a_pty_is_paced_and_its_rate_counts(served, tmp_path):
 def test_a_link_does_not_take_the_place_of_a_file(tmp_path):
     (tmp_path / "notes").write_text("mine")
     with pytest.raises(InvalidSetting, match="symlink"):
-        PtyEmulator(Device(Board()), tmp_path / "notes")
+        PtyEmulator(EmulatedDevice(EmulatedBoard()), tmp_path / "notes")
     assert (tmp_path / "notes").read_text() == "mine"
 
 

@@ -27,7 +27,7 @@ def board():
     board = Ssc32("real", BoardConfig(port), TimeoutConfig(), RealClock())
     board.connect()
     yield board
-    board.limp([FREE])
+    board.torque_off([FREE])
     board.close()
 
 
@@ -42,7 +42,7 @@ def test_it_answers_every_time(board):
 
 
 def test_a_channel_that_was_let_go_has_no_pulse_and_one_that_was_moved_has(board):
-    board.limp([FREE])
+    board.torque_off([FREE])
     time.sleep(0.05)
     assert board.pulses([FREE]) == {FREE: None}
     board.first_move({FREE: 1500}, None)

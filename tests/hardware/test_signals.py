@@ -8,8 +8,7 @@ import threading
 
 import pytest
 
-from marl_handover.hardware.session import State
-from marl_handover.hardware.signals import Endings, deferred
+from marl_handover.hardware.connection import State, TerminationSignals, deferred_signals
 
 ENDINGS = (signal.SIGTERM, signal.SIGHUP)
 
@@ -22,7 +21,7 @@ def test_endings_are_exceptions_for_as_long_as_somebody_is_connected(rig, two_bo
     before = handlers()
     made = rig(two_boards)
     made.driver.connect()
-    second = Endings()
+    second = TerminationSignals()
     second.begin()
     second.begin()
     made.driver.close()
@@ -38,7 +37,7 @@ def test_handlers_of_others_and_nohup_are_left_alone():
     own = {signal.SIGTERM: lambda number, frame: None, signal.SIGHUP: signal.SIG_IGN}
     before = {number: signal.signal(number, handler) for number, handler in own.items()}
     try:
-        endings = Endings()
+        endings = TerminationSignals()
         endings.begin()
         assert {number: signal.getsignal(number) for number in own} == own
         endings.end()
@@ -53,7 +52,7 @@ def test_a_deferred_signal_comes_at_the_end(error):
     done, before = [], handlers()
 
     def block():
-        with deferred():
+        with deferred_signals():
             os.kill(os.getpid(), signal.SIGINT)
             os.kill(os.getpid(), signal.SIGINT)
             done.append(1)
@@ -71,9 +70,9 @@ def test_other_threads_are_not_concerned():
 
     def work():
         try:
-            endings = Endings()
+            endings = TerminationSignals()
             endings.begin()
-            with deferred():
+            with deferred_signals():
                 failed.extend([] if handlers() == before else [1])
             endings.end()
         except ValueError as error:

@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 
 from marl_handover.errors import HandoverError
 from marl_handover.hardware.clock import VirtualClock
-from marl_handover.hardware.emulator.board import Board, Reply
-from marl_handover.hardware.emulator.device import Device
-from marl_handover.hardware.emulator.faults import parse_faults
+from marl_handover.hardware.emulator.board import EmulatedBoard
+from marl_handover.hardware.emulator.device import EmulatedDevice, parse_faults
 from marl_handover.hardware.emulator.protocol_ssc32emu import mount
 from marl_handover.hardware.errors import (
     BadReply,
@@ -28,7 +27,7 @@ from marl_handover.hardware.ssc32 import Ssc32
 
 def made(faults="", firmware="SSC32-V2.50USB", baud=115200, board=None, dry_run=False, **config):
     clock = VirtualClock()
-    device = Device(board or Board(firmware), baud=baud)
+    device = EmulatedDevice(board or EmulatedBoard(firmware), baud=baud)
     device.add_faults(parse_faults(faults))
     settings = BoardConfig(mount("alone", device, clock), **config)
     return Ssc32("main", settings, TimeoutConfig(), clock, dry_run=dry_run, log_entries=1000), device, clock
@@ -78,7 +77,7 @@ def test_firmware_without_stop_is_refused():
         board.connect()
 
 
-class Liar(Board):
+class Liar(EmulatedBoard):
     """A board that answers what it is told to."""
 
     def __init__(self, replies):
@@ -90,7 +89,7 @@ class Liar(Board):
             return []
         reply = next(self.replies, b"")
         self.said += len(reply)
-        return [Reply(0.0, reply)]
+        return [reply]
 
 
 def test_other_boards_are_refused():
@@ -132,7 +131,7 @@ def test_letting_go():
     board.connect()
     board.first_move({1: 1500, 2: 1500}, None)
     clock.sleep_s(0.1)
-    board.limp([1])
+    board.torque_off([1])
     clock.sleep_s(0.1)
     assert device.outputs_us(clock.now_s())[1:3] == [0.0, 1500.0]
     assert not board.referenced([1])
@@ -221,7 +220,7 @@ def test_a_dry_run_writes_questions_and_stops_only():
     assert (sent.data, sent.written) == (b"#0P1500\r", False)
     board.move({0: 1600}, 100)
     board.stop([0])
-    assert not board.limp([0]).written
+    assert not board.torque_off([0]).written
     clock.sleep_s(0.1)
     assert device.outputs_us(clock.now_s())[0] == 0.0
     assert [line for _, line in device.lines] == [b"\x1bVER\r", b"\x1bSTOP0\r"]
@@ -248,7 +247,6 @@ def fuzz(replies):
         board.moving,
         lambda: board.pulses([0, 5]),
         lambda: board.require_pulses([1]),
-        lambda: board.read_register(4),
     ):
         began_s = clock.now_s()
         try:

@@ -8,10 +8,10 @@ import re
 import numpy as np
 import pytest
 
+from marl_handover.hardware.connection import State
 from marl_handover.hardware.errors import Stopped
-from marl_handover.hardware.gate import JointCommand
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.session import State
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.hardware.settings import ARMS
 from marl_handover.hardware.streaming import stream
 from marl_handover.motion.trajectory import Phase
@@ -164,10 +164,10 @@ def test_two_hundred_stops_with_both_arms_moving(armed, wired, motion):
 
 def test_real_and_simulated_arms_stop_without_each_other(armed, tmp_path, monkeypatch):
     """A simulation beside a session of real arms: neither obeys the other's stop."""
-    from marl_handover.hardware import latch as latches
-    from marl_handover.hardware.latch import PrivateStop
+    from marl_handover.hardware import estop
+    from marl_handover.hardware.estop import PrivateStop
 
-    monkeypatch.setattr(latches, "user_path", lambda suffix: tmp_path / f"user{suffix}")
+    monkeypatch.setattr(estop, "user_path", lambda suffix: tmp_path / f"user{suffix}")
     real = armed()
     simulated = armed()  # its boards take the place of the first ones' names; ports that are open stay
     simulated.driver.latch.leave()

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware.connection import State
+from marl_handover.hardware.emulator.device import make_fault
 from marl_handover.hardware.errors import BoardReset, PortLost, Stalled
-from marl_handover.hardware.gate import GateRejection
-from marl_handover.hardware.session import State
+from marl_handover.hardware.safety_filter import CommandRejected
 from marl_handover.hardware.streaming import stream
 from marl_handover.motion.trajectory import Phase
 
@@ -137,7 +137,7 @@ def test_a_plan_that_must_not_be_is_refused_on_the_way(armed, motion):
     phase = motion.phases[0]
     wrong = phase.joints_rad.copy()
     wrong[len(wrong) // 2 :, 1] -= 0.7
-    with pytest.raises(GateRejection):
+    with pytest.raises(CommandRejected):
         stream(rig.driver, {0: [Phase("approach", phase.t_s, wrong, phase.gripper_mm)]})
     assert rig.driver.state is State.ARMED
 

@@ -8,9 +8,8 @@ import time
 import pytest
 
 from marl_handover.hardware.clock import RealClock, VirtualClock
-from marl_handover.hardware.emulator.board import Board
-from marl_handover.hardware.emulator.device import Device
-from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware.emulator.board import EmulatedBoard
+from marl_handover.hardware.emulator.device import EmulatedDevice, make_fault
 from marl_handover.hardware.emulator.protocol_ssc32emu import mount
 from marl_handover.hardware.emulator.pty import PtyEmulator
 from marl_handover.hardware.errors import PortLost
@@ -19,7 +18,7 @@ from marl_handover.hardware.ssc32 import Ssc32
 
 
 def made():
-    clock, device = VirtualClock(), Device(Board())
+    clock, device = VirtualClock(), EmulatedDevice(EmulatedBoard())
     clock.until(1.0)
     board = Ssc32("main", BoardConfig(mount("alone", device, clock)), TimeoutConfig(), clock)
     board.connect()
@@ -61,7 +60,7 @@ def test_flushing_a_port_without_cable_fails_as_a_real_one_does(call):
 
 def test_a_stop_does_not_wait_for_an_answer(tmp_path):
     """A board without power never answers; the reader waits for as long as it was told to."""
-    clock, device = RealClock(), Device(Board())
+    clock, device = RealClock(), EmulatedDevice(EmulatedBoard())
     emulator = PtyEmulator(device, tmp_path / "port")
     ended = threading.Event()
     threads = [threading.Thread(target=emulator.serve, args=(ended.is_set,))]

@@ -14,14 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.roll import Roll
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.session_registry import SessionRegistry
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.perception.overlay import jpeg
 from marl_handover.runtime.feed import EVENTS_FILE, FORMAT, PICTURE_FILE, SILENT_S, STATE_FILE, VERSION, Feed, NotSteerable
 from marl_handover.runtime.steering import ControlFolder
 
-pytestmark = pytest.mark.usefixtures("alone")
+pytestmark = pytest.mark.usefixtures("empty_session_registry")
 
 
 def state(**fields):
@@ -221,8 +221,8 @@ def test_a_latch_that_cannot_be_written_interrupts_the_session(tmp_path):
     put(tmp_path, state(pid=process.pid, stop_file=str(tmp_path / "file" / "stop")))
     feed = Feed(tmp_path)
     assert "CUT THE POWER" in feed.stop("page"), "a process that has not signed up as a session is none"
-    Roll().folder.mkdir(exist_ok=True)
-    signed = Roll().folder / f"{process.pid}-0.json"
+    SessionRegistry().folder.mkdir(exist_ok=True)
+    signed = SessionRegistry().folder / f"{process.pid}-0.json"
     signed.write_text(json.dumps({"pid": process.pid, "stop_file": str(tmp_path / "file" / "stop")}))
     assert f"interrupted process {process.pid}" in feed.stop("page")
     assert process.communicate(timeout=30)[0] == "halted\n"
@@ -258,15 +258,15 @@ def test_stop_replaces_no_file_that_is_no_stop_file(tmp_path):
 
 def test_a_stop_reaches_what_a_session_signed_up_with_and_what_its_folder_says(tmp_path):
     """A session that has not connected yet has not signed up, while another one of the same process may have."""
-    entry = Roll().sign(tmp_path / "signed")
+    entry = SessionRegistry().register(tmp_path / "signed")
     put(tmp_path, state(stop_file=str(tmp_path / "told")))
     assert Feed(tmp_path).stop("page") == f"stop latched in {tmp_path / 'signed'} and {tmp_path / 'told'}"
     assert StopLatch(tmp_path / "signed").reason() == StopLatch(tmp_path / "told").reason() == "page"
-    Roll.leave(entry)
+    SessionRegistry.leave(entry)
 
 
 def test_of_several_sessions_of_a_process_only_the_one_that_is_shown_is_stopped(tmp_path):
-    entries = [Roll().sign(tmp_path / name) for name in ("other", "shown", "third")]
+    entries = [SessionRegistry().register(tmp_path / name) for name in ("other", "shown", "third")]
     put(tmp_path, state(stop_file=str(tmp_path / "shown")))
     feed = Feed(tmp_path)
     assert feed.stop("page") == f"stop latched in {tmp_path / 'shown'}"
@@ -274,7 +274,7 @@ def test_of_several_sessions_of_a_process_only_the_one_that_is_shown_is_stopped(
     assert not (tmp_path / "other").exists()
     assert not (tmp_path / "third").exists()
     for entry in entries:
-        Roll.leave(entry)
+        SessionRegistry.leave(entry)
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root gives files away")

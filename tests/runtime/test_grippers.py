@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from marl_handover.config import MotionConfig
 from marl_handover.errors import CorruptFile, InvalidSetting
+from marl_handover.hardware.board_group import gripper_pulse_us
 from marl_handover.hardware.calibration import CalibrationProblem
 from marl_handover.hardware.settings import ARMS, GripperConfig
-from marl_handover.hardware.wiring import gripper_pulse_us
 from marl_handover.runtime.gripper_calibration import RANGE_MM, GripperCalibration, places
 from marl_handover.runtime.gripper_file import FILE, save_grippers, shifted, with_grippers
 from marl_handover.runtime.hardware_backend import HardwareBackend

@@ -16,11 +16,11 @@ from marl_handover.cell.build import build_cell, cell_config
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.envs.backends import make_backend
 from marl_handover.errors import MissingFile
-from marl_handover.hardware import latch, roll, settings
-from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware import estop, session_registry, settings
+from marl_handover.hardware.connection import State
+from marl_handover.hardware.emulator.device import make_fault
 from marl_handover.hardware.errors import DeviceError, PulseMismatch, Stopped
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.session import State
+from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.settings import ARMS
 from marl_handover.runtime.evaluation import truly_solved
 from marl_handover.runtime.events import FAULTS, Event
@@ -376,7 +376,7 @@ def test_a_board_that_disobeys_ends_the_session_by_name(start, kind):
 
 
 def test_evaluations_on_the_twin_obey_no_stop_and_the_interactive_twin_its_own(twin_calibration, tmp_path, monkeypatch):
-    for module in (roll, settings, latch):
+    for module in (session_registry, settings, estop):
         monkeypatch.setattr(module, "user_path", lambda suffix: tmp_path / f"user{suffix}")
     real, twins = (StopLatch(settings.HardwareConfig(name=name).stop_path()) for name in ("lynxmotion", "twin"))
     model, motion = build_cell(cell_config("paper")), MotionConfig()

@@ -172,7 +172,7 @@ def test_a_session_that_may_be_steered_waits_obeys_fresh_commands_only_and_stops
     assert digest.stopped == "from a page"
 
 
-def test_a_stop_ends_a_pause_before_anything_was_sent(cell, alone):
+def test_a_stop_ends_a_pause_before_anything_was_sent(cell, empty_session_registry):
     def stop():
         until(doing(cell, "paused"))
         cell.feed.stop("enough")

@@ -11,10 +11,10 @@ from marl_handover.arrays import wrap
 from marl_handover.config import MotionConfig
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.driver import ArmDriver
-from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware.emulator.device import make_fault
 from marl_handover.hardware.errors import DeviceError
-from marl_handover.hardware.gate import JointCommand
-from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.perception.detector import Detector
 from marl_handover.runtime.settings import twin_lab
 from marl_handover.runtime.twin import Twin

@@ -15,7 +15,7 @@ from marl_handover.cell import build_cell, cell_config
 from marl_handover.cli import main
 from marl_handover.config import TaskConfig
 from marl_handover.geometry.se3 import flat_pose
-from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.estop import StopLatch
 from marl_handover.runtime.feed import EVENTS_FILE, STATE_FILE, Feed, Reading
 from marl_handover.runtime.steering import Ask
 from marl_handover.task.rules import Command, Rules
@@ -23,7 +23,7 @@ from marl_handover.viewer import live_words
 from marl_handover.viewer.live import LivePage, _picking
 from marl_handover.viewer.scene import CellScene
 
-pytestmark = pytest.mark.usefixtures("alone")
+pytestmark = pytest.mark.usefixtures("empty_session_registry")
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 import random
 import re
-from typing import NamedTuple
+from dataclasses import dataclass
 
-from marl_handover.hardware.protocol import CHANNELS, CR, ESC, OFFSET_US, PULSE_US, READING_US, parse_version
+from marl_handover.hardware.protocol import CHANNELS, CR, ESC, PULSE_US, READING_US, parse_version
 
 FRAME_S = 0.02
 
@@ -20,23 +20,11 @@ _MOVES = re.compile(r"((?:#\d+P\d+(?:S\d+)?)+)(?:T(\d+))?")
 _MOVE = re.compile(r"#(\d+)P(\d+)(?:S(\d+))?")
 _OFFSETS = re.compile(r"(?:#\d+PO[+-]?\d+)+")
 _LEVELS = re.compile(r"(?:#\d+[HL])+")
-_REGISTER = re.compile(r"R(\d+)(?:=(-?\d+))?")
 _PULSE_QUERY = re.compile(r"(?:QP\d+)+")
-_INPUTS = re.compile(r"(?:[A-F]L?){1,8}")
-_ANALOG = re.compile(r"(?:V[A-H]){1,8}")
 _STOP = re.compile(r"STOP(\d+)")
 _DIGITS = 5
 _MAX_BUFFER = 512
-_FAST_S, _SLOW_S, _DEFAULTS_S = 100e-6, 0.3, 1.1
-_REGISTERS = {0: 0b10, 1: 600, 2: 70, 4: 960}
-_STARTUP, _DELAY, _OFFSETS_ON, _PULSES_ON, _DISABLED = (1 << bit for bit in (0, 1, 2, 3, 15))
-
-
-class Reply(NamedTuple):
-    """Bytes, and how long after the line's end the board begins to think of sending them."""
-
-    delay_s: float
-    data: bytes
+_OFFSET_US = (-100, 100)
 
 
 class Channel:
@@ -71,20 +59,16 @@ class Channel:
         self.known, self.high = False, high
 
 
-class Board:
+class EmulatedBoard:
     """One SSC-32 or SSC-32U. Times ``t_s`` are the caller's and never go back.
 
     Args:
         firmware: the text that ``VER`` answers; it decides what the board knows.
-        seed: of its analog noise.
+        seed: of what faults change at random.
     """
 
     def __init__(self, firmware: str = "SSC32-V2.50USB", seed: int = 0) -> None:
         self.firmware = parse_version(firmware.encode("ascii", "replace"))
-        self.registers = dict(_REGISTERS)
-        self.startup = ""
-        self.inputs = dict.fromkeys("ABCDEF", False)
-        self.volts = dict.fromkeys("ABCDEFGH", 0.0)
         self.stuck = False
         """Whether ``Q`` answers "moving" for ever, as some boards do at times."""
         self.ignored, self.guessed = 0.0, 0.0
@@ -95,32 +79,11 @@ class Board:
         self.power_up(0.0)
 
     def power_up(self, t_s: float) -> None:
-        """Forget everything but the registers and the startup string."""
+        """Forget everything."""
         self.on_since_s = t_s
         self.channels = [Channel() for _ in range(CHANNELS)]
         self._buffer = bytearray()
-        self._moving_until, self._warm, self._was_low = 0, set[str](), set[str]()
-        flags = self.registers[0]
-        self.baud = 10 * self.registers[4] if self.registers[4] != _REGISTERS[4] else 0
-        """The rate that register 4 asks for, or 0: as the button or the jumpers say."""
-        if flags & _DISABLED:
-            return
-        for number, channel in enumerate(self.channels):
-            if flags & _OFFSETS_ON:
-                channel.offset_us = self.registers.get(32 + number, 0)
-            pulse = self.registers.get(64 + number, 0)
-            if flags & _PULSES_ON and pulse:
-                channel.go(_clamped(pulse), 0, 1)
-        if flags & _STARTUP:
-            for line in self.startup.split(";"):
-                self._execute(line, t_s)
-
-    @property
-    def delays_s(self) -> tuple[float, float]:
-        """Before a reply, and between its bytes."""
-        if not self.registers[0] & _DELAY:
-            return 0.0, 0.0
-        return 1e-6 * self.registers[1], 1e-6 * self.registers[2]
+        self._moving_until = 0
 
     def frame(self, t_s: float) -> int:
         """Number of the frame that is put out at a time."""
@@ -136,9 +99,9 @@ class Board:
         frame = self.frame(t_s)
         return [channel.output(frame) for channel in self.channels]
 
-    def receive(self, data: bytes, t_s: float) -> list[Reply]:
+    def receive(self, data: bytes, t_s: float) -> list[bytes]:
         """Take bytes, the last of which came in at ``t_s``; the replies of the lines that ended."""
-        replies: list[Reply] = []
+        replies: list[bytes] = []
         for part in re.split(rb"(?<=\r)", data):
             ended = part.endswith(CR)
             kept = part[:-1] if ended else part
@@ -152,11 +115,8 @@ class Board:
                 replies += self._execute(text, t_s)
         return replies
 
-    def _execute(self, line: str, t_s: float) -> list[Reply]:
+    def _execute(self, line: str, t_s: float) -> list[bytes]:
         """Carry out one line. What is not understood is dropped in silence."""
-        if line[:5].upper() == "SSCAT":
-            self.startup = (self.startup + line[5:].strip())[:100]
-            return []
         text = line.translate({code: None for code in _SPACE}).upper()
         frame = self.frame(t_s)
         if match := _MOVES.fullmatch(text):
@@ -167,14 +127,9 @@ class Board:
             for number, level in re.findall(r"#(\d+)([HL])", text):
                 if _is_channel(number):
                     self.channels[int(number)].let_go(level == "H")
-        elif match := re.fullmatch(r"#([0-3]):(\d{1,3})", text):
-            for bit in range(8):
-                self.channels[8 * int(match[1]) + bit].let_go(bool(int(match[2]) >> bit & 1))
         elif (match := _STOP.fullmatch(text)) and self.firmware.has_stop:
             if _is_channel(match[1]):
                 self.channels[int(match[1])].hold(frame)
-        elif text.startswith("SSDEL"):
-            self.startup = self.startup[: -int(text[5:])] if text[5:].isdecimal() and int(text[5:]) else self.startup
         else:
             return self._answer(text, frame)
         return []
@@ -202,34 +157,19 @@ class Board:
 
     def _shift(self, text: str) -> None:
         for number, offset in re.findall(r"#(\d+)PO([+-]?\d{1,3})(?=#|$)", text):
-            if _is_channel(number) and OFFSET_US[0] <= int(offset) <= OFFSET_US[1]:
+            if _is_channel(number) and _OFFSET_US[0] <= int(offset) <= _OFFSET_US[1]:
                 self.channels[int(number)].offset_us = int(offset)
 
-    def _answer(self, text: str, frame: int) -> list[Reply]:
+    def _answer(self, text: str, frame: int) -> list[bytes]:
         """Replies to queries."""
         if text == "Q":
             # About the last move's time, not about the servos: a stop changes nothing.
-            return [Reply(_FAST_S, b"+" if self.stuck or frame < self._moving_until else b".")]
+            return [b"+" if self.stuck or frame < self._moving_until else b"."]
         if _PULSE_QUERY.fullmatch(text):
             numbers = re.findall(r"\d+", text)
-            return [Reply(_FAST_S, bytes(self._tens(int(n), frame) for n in numbers))] if all(map(_is_channel, numbers)) else []
+            return [bytes(self._tens(int(n), frame) for n in numbers)] if all(map(_is_channel, numbers)) else []
         if text == "VER":
-            return [Reply(_FAST_S, self.firmware.text.encode() + CR)]
-        if _ANALOG.fullmatch(text):
-            return [Reply(_FAST_S, bytes(self._converted(name) for name in text[1::2]))]
-        if _INPUTS.fullmatch(text):
-            return [Reply(_FAST_S, b"".join(self._digital(name) for name in re.findall(r"[A-F]L?", text)))]
-        if text == "RDFLT":
-            self.registers = dict(_REGISTERS)
-            return [Reply(_DEFAULTS_S, b"OK\r")]
-        if text == "SS":
-            return [Reply(_SLOW_S, f'"{self.startup}"\r'.encode("latin-1"))]
-        if match := _REGISTER.fullmatch(text):
-            number = int(match[1][:_DIGITS])
-            if match[2] is None:
-                return [Reply(_FAST_S, f"{self.registers.get(number, 0)}\r".encode())]
-            if number < 256 and len(match[2]) <= _DIGITS + 1:
-                self.registers[number] = int(match[2])
+            return [self.firmware.text.encode() + CR]
         return []
 
     def _tens(self, number: int, frame: int) -> int:
@@ -242,26 +182,6 @@ class Board:
         pulse = channel.commanded(frame)
         return int((pulse + channel.offset_us * (self.firmware.number < (2, 0))) / 10 + 1e-9) if pulse else 0
 
-    def _digital(self, name: str) -> bytes:
-        """A pin's level; with L low also if it was low at any time since it was last asked for like that."""
-        high = self.inputs[name[0]]
-        if len(name) == 2:
-            high = high and name[0] not in self._was_low
-            self._was_low.discard(name[0])
-        return b"1" if high else b"0"
-
-    def set_input(self, name: str, high: bool) -> None:
-        """Put a level on a pin."""
-        self.inputs[name] = high
-        if not high:
-            self._was_low.add(name)
-
-    def _converted(self, name: str) -> int:
-        if name not in self._warm:
-            self._warm.add(name)
-            return self._random.randrange(256)  # the first conversion of a pin is of no use
-        return min(255, int(self.volts[name] * 256 / 5))
-
 
 def _is_channel(number: str) -> bool:
     return len(number) <= 2 and int(number) < CHANNELS
@@ -269,3 +189,65 @@ def _is_channel(number: str) -> bool:
 
 def _clamped(pulse_us: int) -> int:
     return min(max(pulse_us, PULSE_US[0]), PULSE_US[1])
+
+
+@dataclass(frozen=True)
+class ServoTruth:
+    """What a servo is really like. Positions ``p`` are rad for a joint, mm for a gripper.
+
+    ``pulse = zero_us + slope_us * p``; ``low`` and ``high`` are the end stops, ``speed`` per second.
+    """
+
+    zero_us: float
+    slope_us: float
+    low: float
+    high: float
+    speed: float
+    dead_band_us: float = 8.0
+    lag_s: float = 0.03
+    settle_sd_us: float = 0.0
+
+
+class Servo:
+    """A servo that stands at ``position`` (rad or mm) when it is first powered."""
+
+    def __init__(self, truth: ServoTruth, position: float, seed: int = 0) -> None:
+        self.truth = truth
+        self._random = random.Random(seed)
+        self._pulse_us, self._moved, self._error_us = 0.0, False, 0.0
+        self.jammed = False
+        """Something holds it: it pushes and does not move."""
+        self.put(position)
+
+    @property
+    def position(self) -> float:
+        """Where it truly is."""
+        return (self._at_us - self.truth.zero_us) / self.truth.slope_us
+
+    @property
+    def pushing(self) -> bool:
+        """Whether it strains against an end stop or an obstacle; hobby servos burn out like that."""
+        stuck = self.jammed or not self._low_us < self._at_us < self._high_us
+        return stuck and self._pulse_us > 0 and abs(self._pulse_us - self._at_us) > 2 * self.truth.dead_band_us
+
+    def put(self, position: float) -> None:
+        """Turn it by hand."""
+        truth = self.truth
+        self._low_us, self._high_us = sorted((truth.zero_us + truth.slope_us * truth.low, truth.zero_us + truth.slope_us * truth.high))
+        self._at_us = min(max(truth.zero_us + truth.slope_us * position, self._low_us), self._high_us)
+
+    def step(self, pulse_us: float, duration_s: float) -> None:
+        """Follow a pulse for a while; 0 is none, and it stays where it is."""
+        truth = self.truth
+        if pulse_us != self._pulse_us:
+            self._pulse_us, self._moved = pulse_us, True
+        elif self._moved:
+            self._moved, self._error_us = False, self._random.gauss(0.0, truth.settle_sd_us)
+        if pulse_us <= 0.0 or self.jammed:
+            return
+        gap = pulse_us + self._error_us - self._at_us
+        beyond = abs(gap) - truth.dead_band_us / 2
+        if beyond > 0.0:
+            fastest = truth.speed * abs(truth.slope_us) * duration_s
+            self._at_us += math.copysign(min(fastest, beyond * -math.expm1(-duration_s / truth.lag_s)), gap)
+            self._at_us = min(max(self._at_us, self._low_us), self._high_us)

@@ -3,22 +3,96 @@
 from __future__ import annotations
 
 import heapq
+import math
 import random
 import re
 from collections import deque
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
-from marl_handover.hardware.emulator.board import FRAME_S, Board
-from marl_handover.hardware.emulator.faults import Fault
-from marl_handover.hardware.emulator.servo import Servo
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_handover.config import require_choice
+from marl_handover.errors import BadOverride
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.urdf import ARM_JOINTS
+from marl_handover.hardware.clock import Clock
+from marl_handover.hardware.emulator.board import FRAME_S, EmulatedBoard, Servo, ServoTruth
+from marl_handover.hardware.settings import ARMS, HardwareConfig
+
+KINDS = {
+    "unplug": "the USB cable is out",
+    "brownout": "the supply breaks down: the board forgets everything (an instant; the duration is how long it is off)",
+    "silent": "no supply for the controller: the port is there, nothing answers, nothing moves",
+    "drop": "replies get lost, each with the given probability (1)",
+    "corrupt": "reply bytes change, each with the given probability (0.5)",
+    "late": "replies come the given time late (0.25 s)",
+    "stuck": "Q says that a move goes on, for ever",
+    "ignore": "moves are not carried out, each with the given probability (1)",
+    "random": "QP answers pulses at random, each with the given probability (1)",
+    "frozen": "QP answers what it did when the fault began",
+    "jam": "the servo of the given channel (0) is held fast",
+}
+_USUAL = {"drop": 1.0, "corrupt": 0.5, "late": 0.25, "jam": 0.0, "ignore": 1.0, "random": 1.0}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of a kind from ``start_s`` on the device's clock, for ``duration_s``. What ``amount`` means depends on the kind."""
+
+    kind: str
+    start_s: float
+    duration_s: float = math.inf
+    amount: float = 0.0
+
+    @property
+    def end_s(self) -> float:
+        """When it is over."""
+        return self.start_s + self.duration_s
+
+    def active(self, t_s: float) -> bool:
+        """Whether it is in force."""
+        return self.start_s <= t_s < self.end_s
+
+
+def make_fault(kind: str, start_s: float, duration_s: float | None = None, amount: float | None = None) -> Fault:
+    """A fault, with the kind's usual amount and duration where none is given. Raises :class:`UnknownChoice` for an unknown kind."""
+    require_choice("fault", kind, tuple(KINDS))
+    lasting = (0.0 if kind == "brownout" else math.inf) if duration_s is None else duration_s
+    return Fault(kind, start_s, lasting, _USUAL.get(kind, 0.0) if amount is None else amount)
+
+
+def parse_faults(text: str) -> list[Fault]:
+    """Faults of a text ``kind@start[:duration][=amount]``, separated by commas; times in s.
+
+    Raises :class:`UnknownChoice` for an unknown kind and :class:`BadOverride` for what cannot be read.
+    """
+    faults = []
+    for item in filter(None, (part.strip() for part in text.split(","))):
+        head, _, amount = item.partition("=")
+        kind, at, times = head.partition("@")
+        start, _, duration = times.partition(":")
+        try:
+            numbers = [float(number) if number else None for number in (start if at else "0", duration, amount)]
+        except ValueError:
+            raise BadOverride(f"faults={item}", "expected kind@start[:duration][=amount], such as unplug@5:1.5") from None
+        if any(number is not None and not (math.isfinite(number) and number >= 0) for number in numbers):
+            raise BadOverride(f"faults={item}", "times and amounts are finite and not negative")
+        faults.append(make_fault(kind, numbers[0] or 0.0, numbers[1], numbers[2]))
+    return faults
+
 
 BITS_PER_BYTE = 10
 """Start bit, eight data bits, stop bit."""
 
+_ANSWER_S, _REPLY_DELAY_S, _BYTE_GAP_S = 100e-6, 1e-6 * 600, 1e-6 * 70
+"""How long the board thinks, and, as it is delivered, waits before a reply and between its bytes."""
+
 _POWER = ("brownout", "silent")
 
 
-class Device:
+class EmulatedDevice:
     """What is plugged into one port. All times are in s on one clock, and never go back; nothing happens but by :meth:`advance`.
 
     Args:
@@ -30,10 +104,10 @@ class Device:
     """
 
     def __init__(
-        self, board: Board, servos: Mapping[int, Servo] | None = None, *, baud: int = 115200, boot_s: float = 0.2, seed: int = 0
+        self, board: EmulatedBoard, servos: Mapping[int, Servo] | None = None, *, baud: int = 115200, boot_s: float = 0.2, seed: int = 0
     ) -> None:
         self.board, self.servos = board, dict(servos or {})
-        self.baud, self.boot_s = board.baud or baud, boot_s
+        self.baud, self.boot_s = baud, boot_s
         self.host_baud = self.baud
         self.lines: deque[tuple[float, bytes]] = deque(maxlen=1000)
         """The last lines that the board was sent, and when each ended."""
@@ -144,7 +218,6 @@ class Device:
             self._outgoing.clear()
             if self._powered:
                 self.board.power_up(self._now_s)
-                self.baud = self.board.baud or self.baud
         elif fault.kind == "stuck":
             self.board.stuck = begins
         elif fault.kind == "ignore":
@@ -166,14 +239,13 @@ class Device:
         if piece.endswith(b"\r"):
             self.lines.append((t_s, self._fragment))
             self._fragment = b""
-        delay_s, between_s = self.board.delays_s
         for reply in self.board.receive(piece, t_s):
             if (lost := self._active("drop")) and self._random.random() < lost.amount:
                 continue
             late = self._active("late")
-            at_s = max(t_s + reply.delay_s + delay_s + (late.amount if late else 0.0), self._said_until_s)
-            for byte in self._damaged(reply.data):
-                at_s += BITS_PER_BYTE / self.baud + between_s
+            at_s = max(t_s + _ANSWER_S + _REPLY_DELAY_S + (late.amount if late else 0.0), self._said_until_s)
+            for byte in self._damaged(reply):
+                at_s += BITS_PER_BYTE / self.baud + _BYTE_GAP_S
                 self._outgoing.append((at_s, byte))
             self._said_until_s = at_s
 
@@ -193,3 +265,98 @@ class Device:
             for number, servo in self.servos.items():
                 servo.step(self.board.channels[number].output(frame) if self._powered else 0.0, until_s - self._now_s)
             self._now_s = until_s
+
+
+Floats = NDArray[np.float64]
+
+
+class EmulatedCell:
+    """Boards and servos as the settings wire them, each servo with a scale, an offset and a dead band of its own, drawn from the seed.
+
+    Args:
+        config: the electronics; ``config.emulator`` says what the servos are like.
+        arm: kinematics; their limits say where the end stops are.
+        standing_rad: (5,) where the joints stand when nothing was ever switched on: whoever sets up a cell puts the arms there.
+        gripper_mm: the same of the fingers.
+    """
+
+    def __init__(self, config: HardwareConfig, arm: ArmModel, standing_rad: ArrayLike, gripper_mm: float = 12.0) -> None:
+        config.validate()
+        self.config, self._arm = config, arm
+        self._random = random.Random(config.emulator.seed)
+        self.truths = {name: self._drawn(name) for name in ARMS}
+        """Arm -> the five joints' servos as they truly are, then the gripper's."""
+        servos: dict[str, dict[int, Servo]] = {name: {} for name in config.used_boards()}
+        stand = [*(float(angle) for angle in np.asarray(standing_rad, float)), gripper_mm]
+        for arm_name, truths in self.truths.items():
+            for channel, truth, position in zip(config.channels(arm_name), truths, stand, strict=True):
+                servos[config.arms[arm_name].board][channel] = Servo(truth, position, self._random.randrange(2**31))
+        emulator = config.emulator
+        self.devices = {
+            name: EmulatedDevice(
+                EmulatedBoard(emulator.firmware, emulator.seed),
+                found,
+                baud=config.boards[name].baud,
+                boot_s=emulator.boot_s,
+                seed=emulator.seed,
+            )
+            for name, found in servos.items()
+        }
+
+    def mount(self, clock: Clock) -> dict[str, str]:
+        """Put every board behind the URL ``ssc32emu://<its name>``; the URLs by board."""
+        from marl_handover.hardware.emulator.protocol_ssc32emu import mount
+
+        return {name: mount(name, device, clock) for name, device in self.devices.items()}
+
+    def joints_rad(self, t_s: float) -> Floats:
+        """Where the joints truly are: (num_arms, 5)."""
+        return self._positions(t_s)[:, :-1]
+
+    def gripper_mm(self, t_s: float) -> Floats:
+        """How far each hand's fingers would be from closed if nothing were between them: (num_arms,)."""
+        return self._positions(t_s)[:, -1]
+
+    def put(self, arm: int, joints_rad: ArrayLike, t_s: float) -> None:
+        """Turn an arm's joints (5,) by hand; servos that get a pulse turn back."""
+        self._positions(t_s)
+        for servo, angle in zip(self.servos(arm), np.asarray(joints_rad, float), strict=False):
+            servo.put(float(angle))
+
+    def servos(self, arm: int) -> list[Servo]:
+        """An arm's servos, the gripper's last."""
+        name = ARMS[arm]
+        device = self.devices[self.config.arms[name].board]
+        return [device.servos[channel] for channel in self.config.channels(name)]
+
+    def _positions(self, t_s: float) -> Floats:
+        for device in self.devices.values():
+            device.advance(t_s)
+        return np.array([[servo.position for servo in self.servos(arm)] for arm in range(len(ARMS))])
+
+    def _drawn(self, arm: str) -> list[ServoTruth]:
+        """The servos of an arm."""
+        config, emulator = self.config, self.config.emulator
+        beyond = math.radians(emulator.end_stop_deg)
+        speeds = [math.radians(speed) for speed in emulator.speed_deg_s]
+        truths = []
+        for index, joint in enumerate(ARM_JOINTS):
+            nominal = config.nominal[joint]
+            zero_us = nominal.zero_us + self._error(emulator.offset_sd_us)
+            slope = math.degrees(nominal.us_per_deg) * (1 + self._error(emulator.scale_sd))
+            low, high = self._arm.lower_rad[index] - beyond, self._arm.upper_rad[index] + beyond
+            truths.append(self._truth(zero_us, slope, float(low), float(high), speeds[index]))
+        gripper = config.arms[arm].gripper
+        zero_us = gripper.closed_us + self._error(emulator.offset_sd_us)
+        slope = (gripper.open_us - gripper.closed_us) / gripper.open_mm * (1 + self._error(emulator.scale_sd))
+        radius_mm = 10.0  # of the gripper servo's crank
+        truths.append(self._truth(zero_us, slope, 0.0, config.gate.finger_mm + 1.0, speeds[-1] * radius_mm))
+        return truths
+
+    def _truth(self, zero_us: float, slope_us: float, low: float, high: float, speed: float) -> ServoTruth:
+        emulator = self.config.emulator
+        band_us = max(0.0, emulator.dead_band_us + self._error(emulator.dead_band_sd_us))
+        return ServoTruth(zero_us, slope_us, low, high, speed, band_us, emulator.lag_s, emulator.settle_sd_us)
+
+    def _error(self, sd: float) -> float:
+        return max(-2.0, min(2.0, self._random.gauss(0.0, 1.0))) * sd

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.hardware import latch as latches
-from marl_handover.hardware.latch import NotCleared, PrivateStop, StopLatch
-from marl_handover.hardware.roll import NoRoll, Roll
+from marl_handover.hardware import estop
+from marl_handover.hardware.estop import NotCleared, PrivateStop, StopLatch
+from marl_handover.hardware.session_registry import RegistryUnusable, SessionRegistry
 from marl_handover.hardware.settings import HardwareConfig
 
 
@@ -34,7 +34,7 @@ def test_it_stays_until_it_is_cleared(tmp_path):
 
 def test_another_process_stops_this_one(tmp_path):
     latch = StopLatch(tmp_path / "stop")
-    code = f"from marl_handover.hardware.latch import StopLatch; StopLatch({str(tmp_path / 'stop')!r}).latch('typed stop')"
+    code = f"from marl_handover.hardware.estop import StopLatch; StopLatch({str(tmp_path / 'stop')!r}).latch('typed stop')"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
     assert latch.reason() == "typed stop"
 
@@ -48,8 +48,8 @@ def test_when_in_doubt_it_is_a_stop(tmp_path):
 
 
 def test_a_stop_says_whether_everybody_obeyed(tmp_path):
-    roll = Roll(tmp_path / "roll")
-    button, one, two = (StopLatch(tmp_path / "stop", roll) for _ in range(3))
+    registry = SessionRegistry(tmp_path / "sessions")
+    button, one, two = (StopLatch(tmp_path / "stop", registry) for _ in range(3))
     one.join()
     two.join()
     button.latch("now")
@@ -64,49 +64,49 @@ def test_a_stop_says_whether_everybody_obeyed(tmp_path):
     assert button.obeyed_by() is None, "an old receipt is no receipt"
 
 
-def test_a_session_is_on_the_roll_of_its_own_stop_file_only(tmp_path):
-    roll = Roll(tmp_path / "roll")
-    latch = StopLatch(tmp_path / "stop", roll)
+def test_a_session_is_in_the_registry_of_its_own_stop_file_only(tmp_path):
+    registry = SessionRegistry(tmp_path / "sessions")
+    latch = StopLatch(tmp_path / "stop", registry)
     latch.join()
     latch.join()
-    assert [(it.pid, it.stop_file, it.obeyed) for it in roll.signed()] == [(os.getpid(), tmp_path / "stop", False)]
-    assert roll.signed(tmp_path / "other") == []
+    assert [(it.pid, it.stop_file, it.obeyed) for it in registry.registered()] == [(os.getpid(), tmp_path / "stop", False)]
+    assert registry.registered(tmp_path / "other") == []
     latch.leave()
-    assert roll.signed() == []
-    assert list(roll.folder.iterdir()) == []
+    assert registry.registered() == []
+    assert list(registry.folder.iterdir()) == []
 
 
 def test_the_roll_of_a_process_that_was_killed_is_empty(tmp_path):
-    folder = tmp_path / "roll"
+    folder = tmp_path / "sessions"
     code = f"""
 import os, signal
 from pathlib import Path
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.roll import Roll
-latch = StopLatch("/tmp/nothing", Roll(Path({str(folder)!r})))
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.session_registry import SessionRegistry
+latch = StopLatch("/tmp/nothing", SessionRegistry(Path({str(folder)!r})))
 latch.join()
-assert len(latch.roll.signed()) == 1
+assert len(latch.registry.registered()) == 1
 os.kill(os.getpid(), signal.SIGKILL)
 """
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == -9
     assert len(list(folder.iterdir())) == 1
-    assert Roll(folder).signed() == []
+    assert SessionRegistry(folder).registered() == []
 
 
 def test_nothing_runs_without_a_roll(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(NoRoll, match="cannot sign up"):
-        StopLatch(tmp_path / "stop", Roll(tmp_path / "file")).join()
+    with pytest.raises(RegistryUnusable, match="cannot sign up"):
+        StopLatch(tmp_path / "stop", SessionRegistry(tmp_path / "file")).join()
 
 
-def test_a_driver_is_on_the_roll_as_long_as_it_holds_its_ports(rig):
+def test_a_driver_is_in_the_registry_as_long_as_it_holds_its_ports(rig):
     made = rig()
-    names = [entry.entry for entry in made.latch.roll.signed(made.latch.path)]
+    names = [entry.entry for entry in made.latch.registry.registered(made.latch.path)]
     assert names == []
     made.driver.connect()
-    assert [entry.pid for entry in made.latch.roll.signed(made.latch.path)] == [os.getpid()]
+    assert [entry.pid for entry in made.latch.registry.registered(made.latch.path)] == [os.getpid()]
     made.driver.disconnect()
-    assert made.latch.roll.signed(made.latch.path) == []
+    assert made.latch.registry.registered(made.latch.path) == []
 
 
 def test_every_session_of_a_user_looks_at_the_same_file(monkeypatch, tmp_path):
@@ -204,63 +204,63 @@ def test_a_stop_that_cannot_be_replaced_is_latched_all_the_same(tmp_path):
 
 def test_a_roll_that_somebody_else_laid_out_is_not_used(tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "roll").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(NoRoll, match="not a folder"):
-        Roll(tmp_path / "roll").sign(tmp_path / "stop")
-    roll = Roll(tmp_path / "theirs")
-    roll.folder.mkdir()
-    os.mkfifo(roll.folder / "1-0.json")
+    (tmp_path / "sessions").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(RegistryUnusable, match="not a folder"):
+        SessionRegistry(tmp_path / "sessions").register(tmp_path / "stop")
+    registry = SessionRegistry(tmp_path / "theirs")
+    registry.folder.mkdir()
+    os.mkfifo(registry.folder / "1-0.json")
     uid = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: uid + 1)
-    assert roll.signed() == []
-    with pytest.raises(NoRoll, match="somebody else"):
-        roll.sign(tmp_path / "stop")
+    assert registry.registered() == []
+    with pytest.raises(RegistryUnusable, match="somebody else"):
+        registry.register(tmp_path / "stop")
 
 
 @pytest.mark.parametrize(
     "entry", ['{"pid": 0, "stop_file": "/x"}', '{"pid": -1, "stop_file": "/x"}', '{"pid": 1e400}', "[" * 9999, "[]", "7", "x" * 20_000]
 )
 def test_entries_that_are_none_count_for_nothing(tmp_path, entry):
-    roll = Roll(tmp_path / "roll")
-    roll.folder.mkdir()
-    (roll.folder / "1-0.json").write_text(entry)
-    assert roll.signed() == []
+    registry = SessionRegistry(tmp_path / "sessions")
+    registry.folder.mkdir()
+    (registry.folder / "1-0.json").write_text(entry)
+    assert registry.registered() == []
 
 
 def test_another_process_with_the_number_of_one_that_was_killed_is_not_taken_for_it(tmp_path):
-    roll = Roll(tmp_path / "roll")
-    entry = roll.sign(tmp_path / "stop")
+    registry = SessionRegistry(tmp_path / "sessions")
+    entry = registry.register(tmp_path / "stop")
     about = json.loads(entry.read_text())
     entry.write_text(json.dumps(about | {"started": "1"}))
-    assert roll.signed() == []
+    assert registry.registered() == []
 
 
 def test_a_process_that_is_over_but_not_yet_buried_is_not_waited_for(tmp_path):
-    roll = Roll(tmp_path / "roll")
-    roll.folder.mkdir()
+    registry = SessionRegistry(tmp_path / "sessions")
+    registry.folder.mkdir()
     process = subprocess.Popen([sys.executable, "-c", ""])
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-    (roll.folder / "1-0.json").write_text(json.dumps({"pid": process.pid, "stop_file": "/x"}))
-    assert roll.signed() == []
+    (registry.folder / "1-0.json").write_text(json.dumps({"pid": process.pid, "stop_file": "/x"}))
+    assert registry.registered() == []
     process.wait()
 
 
 def test_sessions_of_others_are_seen(tmp_path, monkeypatch):
     """As whoever has another number sees this user's."""
     uid = os.getuid()
-    roll = Roll(tmp_path / f"marl-handover-{uid}.sessions")
-    roll.sign(tmp_path / "stop")
-    assert stat.S_IMODE(roll.folder.stat().st_mode) == 0o755
+    registry = SessionRegistry(tmp_path / f"marl-handover-{uid}.sessions")
+    registry.register(tmp_path / "stop")
+    assert stat.S_IMODE(registry.folder.stat().st_mode) == 0o755
     (tmp_path / f"marl-handover-{uid + 7}.sessions").mkdir()  # not of whom it says
     monkeypatch.setattr(os, "getuid", lambda: uid + 1)
-    other = Roll(tmp_path / f"marl-handover-{uid + 1}.sessions")
+    other = SessionRegistry(tmp_path / f"marl-handover-{uid + 1}.sessions")
     assert [(it.pid, it.stop_file) for it in other.others()] == [(os.getpid(), tmp_path / "stop")]
     assert other.others()[0].owner
 
     scan = os.scandir
 
     def closed(folder):
-        if folder == roll.folder:
+        if folder == registry.folder:
             raise PermissionError(13, "closed")
         return scan(folder)
 
@@ -271,7 +271,7 @@ def test_sessions_of_others_are_seen(tmp_path, monkeypatch):
 
 
 def test_a_private_stop_concerns_nobody_else(tmp_path, monkeypatch):
-    monkeypatch.setattr(latches, "user_path", lambda suffix: tmp_path / f"user{suffix}")
+    monkeypatch.setattr(estop, "user_path", lambda suffix: tmp_path / f"user{suffix}")
     one, two = PrivateStop(), PrivateStop()
     one.join()
     assert not one.is_set()

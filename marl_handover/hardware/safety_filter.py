@@ -1,4 +1,4 @@
-"""The safety gate: every command passes it on its way to the wire, and every refusal says what it found and what is allowed.
+"""The safety filter: every command passes it on its way to the wire, and every refusal says what it found and what is allowed.
 
 It stands below planning and trusts none of it. It models where the arms have been sent, by time, and judges each command from there:
 numbers, joint limits, pulses, age, step, speed, and the room swept on the way: table, the arm itself, the other arm.
@@ -59,14 +59,14 @@ class Reason(enum.StrEnum):
     OTHER_ARM = "other arm"
 
 
-class GateRejection(WorkFailed):
+class CommandRejected(WorkFailed):
     """A command that is not sent. ``value`` and ``limit`` are in the units of the message."""
 
     def __init__(self, reason: Reason, arm: int | None, what: str, value: Any, limit: str) -> None:
         self.reason, self.arm, self.what, self.value, self.limit = reason, arm, what, value, limit
         shown = f"{value:.2f}" if isinstance(value, float) else value
         whose = "" if arm is None else f"arm {ARMS[arm] if arm in range(len(ARMS)) else arm}, "
-        super().__init__(f"safety gate ({reason}): {whose}{what} is {shown}; allowed: {limit}")
+        super().__init__(f"safety filter ({reason}): {whose}{what} is {shown}; allowed: {limit}")
 
 
 class JointCommand(NamedTuple):
@@ -101,7 +101,7 @@ class _Held(NamedTuple):
         return np.array([self.at(now_s), late, self.target if aim is None else aim])
 
 
-class SafetyGate:
+class SafetyFilter:
     """Judges commands for all arms of a cell.
 
     Args:
@@ -152,7 +152,7 @@ class SafetyGate:
     def check(self, commands: Sequence[JointCommand], duration_s: float, now_s: float, made_s: float) -> None:
         """Judge commands that are to be carried out together in ``duration_s`` from ``now_s``, thought of at ``made_s``.
 
-        Raises :class:`GateRejection` with the first thing that is wrong. A gate that is not enabled looks at form and numbers only.
+        Raises :class:`CommandRejected` with the first thing that is wrong. A filter that is not enabled looks at form and numbers only.
         """
         self._check_times(duration_s, now_s, made_s)
         targets = self._targets(commands)
@@ -161,7 +161,7 @@ class SafetyGate:
         for arm, target in targets.items():
             held = self._held[arm]
             if held is None:
-                raise GateRejection(Reason.NO_REFERENCE, arm, "its position", "unknown", "an arm that was armed in its parked pose")
+                raise CommandRejected(Reason.NO_REFERENCE, arm, "its position", "unknown", "an arm that was armed in its parked pose")
             self._check_ends(arm, target)
             self._check_way(arm, np.abs(target - held.at(now_s)), duration_s)
         self.check_room(targets, now_s)
@@ -169,7 +169,7 @@ class SafetyGate:
     def check_stand(self, commands: Sequence[JointCommand]) -> None:
         """Judge poses of all arms as places to stand in, whatever the way there; as before a first move, whose way nobody knows.
 
-        Raises :class:`GateRejection`.
+        Raises :class:`CommandRejected`.
         """
         targets = self._targets(commands)
         if not self.limits.enabled:
@@ -206,37 +206,37 @@ class SafetyGate:
     def _check_times(self, duration_s: float, now_s: float, made_s: float) -> None:
         for name, value in (("the duration", duration_s), ("when it was made", made_s)):
             if not _is(value, Real):
-                raise GateRejection(Reason.SHAPE, None, name, repr(value), "a number of seconds")
+                raise CommandRejected(Reason.SHAPE, None, name, repr(value), "a number of seconds")
         if not (math.isfinite(duration_s) and 0.0 < duration_s <= 60.0):
-            raise GateRejection(Reason.DURATION, None, "the duration", duration_s, "above 0 and up to 60 s")
+            raise CommandRejected(Reason.DURATION, None, "the duration", duration_s, "above 0 and up to 60 s")
         age_s = now_s - made_s
         if self.limits.enabled and not -_ROUNDING <= age_s <= self.limits.stale_s:
-            raise GateRejection(Reason.STALE, None, "its age", age_s, f"0 to {self.limits.stale_s:g} s")
+            raise CommandRejected(Reason.STALE, None, "its age", age_s, f"0 to {self.limits.stale_s:g} s")
 
     def _targets(self, commands: Sequence[JointCommand]) -> dict[int, Floats]:
         """Joints and fingers (6,) by arm."""
         found = [self.target(command) for command in commands]
         targets = {int(command.arm): target for command, target in zip(commands, found, strict=True)}
         if not commands or len(targets) != len(commands):
-            raise GateRejection(
+            raise CommandRejected(
                 Reason.SHAPE, None, "arms of the command", [command.arm for command in commands], "each at most once, at least one"
             )
         return targets
 
     def target(self, command: JointCommand) -> Floats:
-        """Joints and fingers (6,) of a command. Raises :class:`GateRejection` if it has not the form of one, or is not finite."""
+        """Joints and fingers (6,) of a command. Raises :class:`CommandRejected` if it has not the form of one, or is not finite."""
         if not _is(command.arm, Integral) or command.arm not in range(len(self._held)):
-            raise GateRejection(Reason.SHAPE, None, "the arm", repr(command.arm), f"0 to {len(self._held) - 1}")
+            raise CommandRejected(Reason.SHAPE, None, "the arm", repr(command.arm), f"0 to {len(self._held) - 1}")
         try:
             target = np.append(np.asarray(command.joints_rad, float), float(command.gripper_mm))
         except (TypeError, ValueError):
             target = np.zeros(0)
         if target.shape != (6,) or np.ndim(command.joints_rad) != 1:
-            raise GateRejection(
+            raise CommandRejected(
                 Reason.SHAPE, command.arm, "the command", np.shape(command.joints_rad), "five angles, and a number for the fingers"
             )
         if not np.isfinite(target).all():
-            raise GateRejection(Reason.NOT_FINITE, command.arm, "the command", target.tolist(), "finite numbers")
+            raise CommandRejected(Reason.NOT_FINITE, command.arm, "the command", target.tolist(), "finite numbers")
         return target
 
     def _check_ends(self, arm: int, target: Floats) -> None:
@@ -246,12 +246,12 @@ class SafetyGate:
             angle = float(target[index])
             if not lower[index] - LIMIT_TOLERANCE_RAD <= angle <= upper[index] + LIMIT_TOLERANCE_RAD:
                 limit = f"{math.degrees(lower[index]):.2f} to {math.degrees(upper[index]):.2f} degrees"
-                raise GateRejection(Reason.JOINT_LIMIT, arm, joint, math.degrees(angle), limit)
+                raise CommandRejected(Reason.JOINT_LIMIT, arm, joint, math.degrees(angle), limit)
         if not 0.0 <= target[5] <= self.limits.finger_mm:
-            raise GateRejection(Reason.GRIPPER, arm, "the opening of each finger", float(target[5]), f"0 to {self.limits.finger_mm:g} mm")
+            raise CommandRejected(Reason.GRIPPER, arm, "the opening of each finger", float(target[5]), f"0 to {self.limits.finger_mm:g} mm")
         for joint, pulse, (low, high) in zip(ARM_JOINTS, np.rint(self.calibrations[arm].to_us(target[:5])), self._pulses[arm], strict=True):
             if not low <= pulse <= high:
-                raise GateRejection(Reason.PULSE_LIMIT, arm, f"the pulse of {joint}", float(pulse), f"{low:g} to {high:g} us")
+                raise CommandRejected(Reason.PULSE_LIMIT, arm, f"the pulse of {joint}", float(pulse), f"{low:g} to {high:g} us")
 
     def _check_way(self, arm: int, change: Floats, duration_s: float) -> None:
         """Whether an arm may change so much, joints and fingers (6,), in one command."""
@@ -259,28 +259,28 @@ class SafetyGate:
         widest = int(np.argmax(change[:5]))
         if change[widest] > step_rad + _ROUNDING:
             what = f"the step of {ARM_JOINTS[widest]}"
-            raise GateRejection(Reason.STEP, arm, what, math.degrees(change[widest]), f"up to {self.limits.step_deg:g} degrees")
+            raise CommandRejected(Reason.STEP, arm, what, math.degrees(change[widest]), f"up to {self.limits.step_deg:g} degrees")
         over = change / duration_s - self._speed * (1 + _ROUNDING)
         worst = int(np.argmax(over / self._speed))
         if over[worst] > 0.0:
             speed, limit, unit = change[worst] / duration_s, self._speed[worst], "mm/s"
             if worst < 5:
                 speed, limit, unit = math.degrees(speed), math.degrees(limit), "degrees/s"
-            raise GateRejection(Reason.SPEED, arm, f"the speed of {_ANGLES[worst]}", float(speed), f"up to {limit:.1f} {unit}")
+            raise CommandRejected(Reason.SPEED, arm, f"the speed of {_ANGLES[worst]}", float(speed), f"up to {limit:.1f} {unit}")
 
     def _check_ways(self, ways: Sequence[Floats | None], commanded: Collection[int], together: bool) -> None:
         """Whether arms may go their ``ways`` (3, 6), None of one that is unknown; those that are ``commanded`` are judged."""
         for arm in commanded:
             own = ways[arm]
             if own is None:
-                raise GateRejection(Reason.NO_REFERENCE, arm, "its position", "unknown", "an arm that was armed in its parked pose")
+                raise CommandRejected(Reason.NO_REFERENCE, arm, "its position", "unknown", "an arm that was armed in its parked pose")
             self._check_alone(arm, own)
             for other, way in enumerate(ways):
                 if other == arm or (other in commanded and other < arm):
                     continue
                 if way is None:
                     limit = "arms that were all armed in their parked pose"
-                    raise GateRejection(Reason.NO_REFERENCE, other, "its position", "unknown", limit)
+                    raise CommandRejected(Reason.NO_REFERENCE, other, "its position", "unknown", limit)
                 self._check_pair(arm, own, other, way, together and other in commanded)
 
     def _holds(self, way: Floats) -> bool:
@@ -297,7 +297,7 @@ class SafetyGate:
         )
         for gap, least, (reason, what) in zip(gaps.tolist(), self._least_mm.tolist(), found, strict=True):
             if gap < least:
-                raise GateRejection(reason, arm, what, gap, f"at least {least:g} mm")
+                raise CommandRejected(reason, arm, what, gap, f"at least {least:g} mm")
 
     def _check_pair(self, arm: int, way: Floats, other: int, other_way: Floats, together: bool) -> None:
         holding, also, least = self._holds(way), self._holds(other_way), self.limits.arm_clearance_mm
@@ -305,7 +305,7 @@ class SafetyGate:
         gap = between_mm(way, other_way, together, shapes, others, self._bases[arm], self._bases[other], least)
         if gap < least:
             what = f"the distance{_with_block(holding)} to the other arm{_with_block(also)} on the way"
-            raise GateRejection(Reason.OTHER_ARM, arm, what, gap, f"at least {least:g} mm")
+            raise CommandRejected(Reason.OTHER_ARM, arm, what, gap, f"at least {least:g} mm")
 
 
 def _with_block(holding: bool) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from marl_handover.errors import CorruptFile, MissingFile, WorkFailed
 from marl_handover.files import read_bounded, temporary_of
-from marl_handover.hardware.roll import Roll, user_name, user_path
+from marl_handover.hardware.session_registry import SessionRegistry, user_name, user_path
 from marl_handover.parsing import parse_object
 
 _LARGEST_BYTES = 64_000
@@ -38,24 +38,24 @@ class StopLatch:
 
     Args:
         path: of the file; every session and ``marl-handover stop`` have to name the same.
-        roll: where sessions sign up; that of this user unless given.
+        registry: where sessions sign up; that of this user unless given.
     """
 
-    def __init__(self, path: Path | str, roll: Roll | None = None) -> None:
-        self.path, self.roll = Path(path), roll or Roll()
+    def __init__(self, path: Path | str, registry: SessionRegistry | None = None) -> None:
+        self.path, self.registry = Path(path), registry or SessionRegistry()
         self._receipt = Path(f"{self.path}.obeyed")
         self._here = ""
         self._entry: Path | None = None
 
     def join(self) -> None:
-        """From now on whoever latches this stop waits for this session to obey. Raises :class:`~marl_handover.hardware.roll.NoRoll`."""
+        """From now on whoever latches this stop waits for this session. Raises :class:`RegistryUnusable`."""
         if self._entry is None:
-            self._entry = self.roll.sign(self.path)
+            self._entry = self.registry.register(self.path)
 
     def leave(self) -> None:
         """This session cannot move anything any more."""
         if self._entry is not None:
-            self.roll.leave(self._entry)
+            self.registry.leave(self._entry)
             self._entry = None
 
     def latch(self, reason: str) -> None:
@@ -100,11 +100,11 @@ class StopLatch:
         with contextlib.suppress(OSError):
             _put(self._receipt, str(os.getpid()))
         if self._entry is not None:
-            self.roll.obeyed(self._entry)
+            self.registry.obeyed(self._entry)
 
     def obeyed_by(self) -> int | None:
         """A process that has stopped since the latch was set; None if none has, or one that runs has not yet: then cut the power."""
-        if not all(session.obeyed for session in self.roll.signed(self.path)):
+        if not all(session.obeyed for session in self.registry.registered(self.path)):
             return None
         try:
             return int(read_bounded(self._receipt, _LARGEST_BYTES, "receipt", own=True))
@@ -142,11 +142,11 @@ class StopLatch:
         with contextlib.suppress(OSError):
             self._receipt.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
-            self.roll.summon(self.path)
+            self.registry.clear_receipts(self.path)
 
 
 class PrivateStop(StopLatch):
-    """The stop of one simulated session: neither on the roll nor set by ``marl-handover stop``. It and real arms never stop each other.
+    """The stop of one simulated session: not registered, and not set by ``marl-handover stop``. It and real arms never stop each other.
 
     Its file has a name that nobody else has; whoever is told it, as a page that shows the session, stops this session alone.
     """

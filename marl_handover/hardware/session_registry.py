@@ -1,4 +1,4 @@
-"""The roll of sessions that can move arms: who has to obey a stop, and who has.
+"""The registry of sessions that can move arms: who has to obey a stop, and who has.
 
 One folder for each user, at a place that no environment variable and no working directory changes, with a file for each session. An entry
 whose process is gone counts for nothing, so a session that was killed need not sign off. Everybody may read the folder, so that whoever
@@ -37,15 +37,15 @@ def user_path(suffix: str) -> Path:
     return shared / f"marl-handover-{os.getuid()}{suffix}"
 
 
-class NoRoll(WorkFailed):
-    """The folder of the roll cannot be used."""
+class RegistryUnusable(WorkFailed):
+    """The folder of the registry cannot be used."""
 
     def __init__(self, folder: Path, why: str) -> None:
         super().__init__(f"sessions cannot sign up in {folder} ({why}), so a stop could not tell whether they obeyed; put that right first")
         self.folder = folder
 
 
-class Signed(NamedTuple):
+class SessionRecord(NamedTuple):
     """A session that runs: its process, the stop file it looks at, and whether it has stopped since that was latched last.
 
     ``owner`` is the other user whose it is; empty: it is this user's. One that cannot be looked into has no ``stop_file``.
@@ -58,30 +58,30 @@ class Signed(NamedTuple):
     owner: str = ""
 
 
-class Roll:
-    """The roll in ``folder``; that of this user unless given."""
+class SessionRegistry:
+    """The registry in ``folder``; that of this user unless given."""
 
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = folder or user_path(".sessions")
 
-    def sign(self, stop_file: Path) -> Path:
+    def register(self, stop_file: Path) -> Path:
         """Put this session down. Returns its entry, for :meth:`obeyed` and :meth:`leave`.
 
         Raises:
-            NoRoll: the folder belongs to somebody else, or cannot be written.
+            RegistryUnusable: the folder belongs to somebody else, or cannot be written.
         """
         about = {"pid": os.getpid(), "started": _started(os.getpid()), "stop_file": str(stop_file.absolute())}
         try:
             self.folder.mkdir(mode=0o755, parents=True, exist_ok=True)
             if not self._own():
-                raise NoRoll(self.folder, "it is not a folder, or belongs to somebody else")
+                raise RegistryUnusable(self.folder, "it is not a folder, or belongs to somebody else")
             self.folder.chmod(0o755)
             entry = self.folder / f"{os.getpid()}-{next(_COUNT)}.json"
             _receipt(entry).unlink(missing_ok=True)
             write_whole(entry, json.dumps(about))
             entry.chmod(0o644)
         except OSError as error:
-            raise NoRoll(self.folder, error.strerror or str(error)) from error
+            raise RegistryUnusable(self.folder, error.strerror or str(error)) from error
         return entry
 
     @staticmethod
@@ -97,9 +97,9 @@ class Roll:
             entry.unlink(missing_ok=True)
             _receipt(entry).unlink(missing_ok=True)
 
-    def signed(self, stop_file: Path | None = None) -> list[Signed]:
+    def registered(self, stop_file: Path | None = None) -> list[SessionRecord]:
         """This user's sessions, all or those that look at ``stop_file``. Entries of processes that are gone are taken off."""
-        found: list[Signed] = []
+        found: list[SessionRecord] = []
         if not self._own():  # somebody else's has nothing to say, and nobody could sign up in it
             return found
         for entry in sorted(self.folder.glob("*.json"))[:_MOST]:
@@ -110,9 +110,9 @@ class Roll:
                 found.append(session)
         return found
 
-    def others(self) -> list[Signed]:
+    def others(self) -> list[SessionRecord]:
         """Sessions of other users of this computer. Of a folder that cannot be read, its user's first process that may be one counts."""
-        found: list[Signed] = []
+        found: list[SessionRecord] = []
         for folder in sorted(self.folder.parent.glob("marl-handover-*.sessions")):
             uid = _folder_of(folder)
             if uid is None or uid == os.getuid() or folder.name != f"marl-handover-{uid}.sessions":
@@ -122,15 +122,15 @@ class Roll:
                     names = [entry.name for entry in itertools.islice(listed, _MOST) if entry.name.endswith(".json")]
             except OSError:
                 pid = next(_processes(uid), 0)
-                found += [Signed(pid, None, False, folder, user_name(uid))] if pid else []
+                found += [SessionRecord(pid, None, False, folder, user_name(uid))] if pid else []
                 continue
             sessions = (_read(folder / name, uid) for name in sorted(names))
             found += [session._replace(owner=user_name(uid)) for session in sessions if session is not None]
         return found
 
-    def summon(self, stop_file: Path) -> None:
+    def clear_receipts(self, stop_file: Path) -> None:
         """A new stop: what was obeyed before is no answer to it."""
-        for session in self.signed(stop_file):
+        for session in self.registered(stop_file):
             _receipt(session.entry).unlink(missing_ok=True)
 
     def _own(self) -> bool:
@@ -165,13 +165,13 @@ def _folder_of(path: Path) -> int | None:
     return about.st_uid if stat.S_ISDIR(about.st_mode) else None
 
 
-def _read(entry: Path, uid: int | None = None) -> Signed | None:
+def _read(entry: Path, uid: int | None = None) -> SessionRecord | None:
     """A session that runs; None: it is over, or this is no entry. Another user's counts only if its process is theirs."""
     try:
         about = read_json(entry, "entry of a session", _ENTRY_BYTES)
         pid, stop_file, started = int(about["pid"]), Path(str(about["stop_file"])), str(about.get("started", ""))
         alive = pid > 0 and _alive(pid, started) and (uid is None or _owner(pid) in (uid, None))
-        return Signed(pid, stop_file, _receipt(entry).exists(), entry) if alive else None
+        return SessionRecord(pid, stop_file, _receipt(entry).exists(), entry) if alive else None
     except (OSError, ValueError, KeyError, TypeError, OverflowError, MissingFile, CorruptFile):
         return None
 

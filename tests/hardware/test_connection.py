@@ -7,11 +7,11 @@ import threading
 
 import pytest
 
-from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware.connection import State
+from marl_handover.hardware.emulator.device import make_fault
 from marl_handover.hardware.errors import BoardReset, PortLost, Stopped, TooSlow
-from marl_handover.hardware.gate import GateRejection, JointCommand, Reason
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.session import State
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason
 
 
 def turned(driver, degrees, arm=0):
@@ -26,7 +26,7 @@ def last_words(driver):
     return [line for line in reversed(lines) if b"QP" not in line]
 
 
-class Meddler(StopLatch):
+class LatchThatLetsAnotherThreadHalt(StopLatch):
     """A latch that is not set; whoever looks at it for the ``number``-th time gives another thread the chance to halt the driver."""
 
     driver, left = None, 0
@@ -44,14 +44,16 @@ class Meddler(StopLatch):
 def test_no_move_is_written_after_another_threads_halt(armed, look):
     rig = armed()
     driver = rig.driver
-    meddler = Meddler(rig.latch.path)
-    meddler.driver, meddler.left, driver.latch = driver, look, meddler
+    latch = LatchThatLetsAnotherThreadHalt(rig.latch.path)
+    rig.latch.leave()
+    latch.join()
+    latch.driver, latch.left, driver.latch = driver, look, latch
     try:
         driver.move([turned(driver, 5.0)], 0.3)
         driver.wait(0.1)
     except Stopped:
         pass
-    meddler.thread.join()
+    latch.thread.join()
     assert driver.state is State.STOPPED
     assert b"STOP" in last_words(driver)[0]
     with pytest.raises(Stopped):
@@ -80,7 +82,7 @@ def test_a_stop_is_not_glued_to_a_move_that_was_cut_short(armed):
 
 def test_resuming_needs_a_pulse_on_every_channel(armed):
     rig = armed()
-    rig.driver.boards.by_name["main"].limp([1])
+    rig.driver.boards.by_name["main"].torque_off([1])
     rig.driver.stop("x")
     rig.latch.clear()
     with pytest.raises(BoardReset) as caught:
@@ -97,7 +99,7 @@ def test_resuming_needs_arms_within_their_limits(armed):
     rig.clock.sleep_s(0.2)
     rig.driver.stop("x")
     rig.latch.clear()
-    with pytest.raises(GateRejection) as caught:
+    with pytest.raises(CommandRejected) as caught:
         rig.driver.resume()
     assert caught.value.reason is Reason.JOINT_LIMIT
     assert rig.driver.state is State.STOPPED
@@ -133,11 +135,11 @@ def test_a_lost_board_does_not_spare_the_other_from_letting_go(armed, two_boards
     rig.cell.devices["west"].add_faults([make_fault("unplug", rig.clock.now_s() + 0.01)])
     rig.clock.sleep_s(0.1)
     with pytest.raises(PortLost):
-        rig.driver.limp()
+        rig.driver.torque_off()
     rig.clock.sleep_s(0.1)
     assert not any(rig.cell.devices["east"].outputs_us(rig.clock.now_s()))
     assert rig.driver.state is State.LOST
-    assert rig.driver.gate.held(0, rig.clock.now_s()) is None
+    assert rig.driver.safety_filter.held(0, rig.clock.now_s()) is None
 
 
 @pytest.mark.parametrize("baud", [38400, 9600, 2400])

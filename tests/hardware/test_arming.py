@@ -15,12 +15,12 @@ from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.capsules import ground_clearance_mm
 from marl_handover.hardware.clearance import FAR_MM, arm_shapes, between_mm, still
+from marl_handover.hardware.connection import State
 from marl_handover.hardware.driver import ArmDriver
-from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware.emulator.device import make_fault
 from marl_handover.hardware.errors import BoardReset, HalfHeld, NotConfirmed, Stopped, WrongState
-from marl_handover.hardware.gate import GateRejection, JointCommand, Reason
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.session import State
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason
 
 
 def moves(rig):
@@ -75,7 +75,7 @@ def test_a_parked_pose_that_is_not_allowed_is_never_sent(rig, model, one_board, 
     made.driver = driver
     driver.connect()
     driver.configure()
-    with pytest.raises(GateRejection) as caught:
+    with pytest.raises(CommandRejected) as caught:
         driver.arm()
     assert caught.value.reason is reason
     assert driver.state is State.CONFIGURED
@@ -130,7 +130,7 @@ def test_held_arms_that_clear_each_other_only_if_both_move_are_not_driven(armed,
     rig = armed()
     driver = put(rig, np.radians(start_deg))
     before = rig.device.outputs_us(rig.clock.now_s())
-    with pytest.raises(GateRejection) as caught:
+    with pytest.raises(CommandRejected) as caught:
         driver.arm()
     assert caught.value.reason is Reason.OTHER_ARM
     rig.clock.sleep_s(1.0)
@@ -150,7 +150,7 @@ def check_stuck(armed, seed, count):
         driver, stuck = put(rig, joints), arms % 2
         jam(rig, stuck, True)
         found = nearest_mm(rig, shapes, bases)
-        with contextlib.suppress(GateRejection):
+        with contextlib.suppress(CommandRejected):
             driver.arm()
             arms += 1
             assert np.degrees(np.abs(rig.cell.joints_rad(rig.clock.now_s())[1 - stuck] - driver.parked_rad)).max() < 8.0
@@ -289,8 +289,8 @@ def test_boards_that_hold_an_arm_outside_its_limits_are_not_believed(armed):
     rig.clock.sleep_s(2.2)
     driver = again(rig)
     seen = len(moves(rig))
-    for call in (driver.arm, driver.rejoin):
-        with pytest.raises(GateRejection, match="elbow, as the board holds it") as caught:
+    for call in (driver.arm, driver.resync):
+        with pytest.raises(CommandRejected, match="elbow, as the board holds it") as caught:
             call()
         assert caught.value.reason is Reason.JOINT_LIMIT
         assert driver.state is State.CONFIGURED
@@ -346,13 +346,13 @@ def test_rejoining_moves_nothing_and_goes_on_from_there(armed):
     before = rig.device.outputs_us(rig.clock.now_s())
     assert before[gripper.channel] > 2400
     joined = again(rig, confirm=None)
-    joined.rejoin()
+    joined.resync()
     assert np.abs(np.subtract(rig.device.outputs_us(rig.clock.now_s()), before)).max() <= 5.0
     assert joined.state is State.ARMED
     assert math.degrees(joined.joints_rad()[0, 0]) == pytest.approx(math.degrees(0.3), abs=1.0)
     joined.park()
     with pytest.raises(WrongState):
-        joined.rejoin()
+        joined.resync()
 
 
 def test_rejoining_a_board_that_forgot_is_refused(rig):
@@ -360,7 +360,7 @@ def test_rejoining_a_board_that_forgot_is_refused(rig):
     made.driver.connect()
     made.driver.configure()
     with pytest.raises(BoardReset):
-        made.driver.rejoin()
+        made.driver.resync()
     assert made.driver.state is State.CONFIGURED
     assert not moves(made)
 

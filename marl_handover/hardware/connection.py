@@ -5,25 +5,26 @@ from __future__ import annotations
 import contextlib
 import enum
 import logging
+import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any
+from weakref import WeakSet
 
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
-from marl_handover.hardware.boards import Boards
+from marl_handover.hardware.board_group import BoardGroup, Pulses, Wiring, readback_state, require_held
 from marl_handover.hardware.calibration import ArmCalibration, calibrations
 from marl_handover.hardware.clock import Clock, RealClock
 from marl_handover.hardware.errors import BoardReset, DeviceError, PortLost, PulseMismatch, Stopped, WrongState
-from marl_handover.hardware.gate import JointCommand, SafetyGate
-from marl_handover.hardware.held import Pulses, require_held, stands
-from marl_handover.hardware.latch import StopLatch
+from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.safety_filter import JointCommand, SafetyFilter
 from marl_handover.hardware.settings import ARMS, HardwareConfig
-from marl_handover.hardware.signals import Endings, deferred
-from marl_handover.hardware.wiring import Wiring
 
 LOG = logging.getLogger(__name__)
-GATE_OFF = (
-    "WARNING: THE SAFETY GATE IS OFF (hardware.gate.enabled=false): nothing keeps the arms from their limits, the table, themselves and "
+FILTER_OFF = (
+    "WARNING: THE SAFETY FILTER IS OFF (hardware.gate.enabled=false): nothing keeps the arms from their limits, the table, themselves and "
     "each other"
 )
 
@@ -45,7 +46,7 @@ class State(enum.StrEnum):
     LOST = "lost"
 
 
-class BoardSession:
+class ArmConnection:
     """Boards of a cell, from not connected to configured. Arguments: see :class:`~marl_handover.hardware.driver.ArmDriver`."""
 
     def __init__(
@@ -65,20 +66,20 @@ class BoardSession:
         self.clock: Clock = clock or RealClock()
         self.latch = latch or StopLatch(config.stop_path())
         self.dry_run, self.state = dry_run, State.DISCONNECTED
-        self.boards = Boards(config, self.clock, dry_run=dry_run, attend=self.obey)
+        self.boards = BoardGroup(config, self.clock, dry_run=dry_run, on_wait=self.check_stop)
         self.calibrations: tuple[ArmCalibration, ...] = ()
-        self._gate: SafetyGate | None = None
+        self._safety_filter: SafetyFilter | None = None
         self._wiring: Wiring | None = None
-        self._endings = Endings()
+        self._signals = TerminationSignals()
         # Held from the last look at state and stop until the line is written and noted, so that no stop can come in between.
         self._writing, self._halts = threading.RLock(), 0
 
     @property
-    def gate(self) -> SafetyGate:
-        """The safety gate. Raises :class:`WrongState` before :meth:`configure`."""
-        if self._gate is None:
-            raise WrongState("use the safety gate", self.state, State.CONFIGURED)
-        return self._gate
+    def safety_filter(self) -> SafetyFilter:
+        """The safety filter. Raises :class:`WrongState` before :meth:`configure`."""
+        if self._safety_filter is None:
+            raise WrongState("use the safety filter", self.state, State.CONFIGURED)
+        return self._safety_filter
 
     @property
     def wiring(self) -> Wiring:
@@ -88,7 +89,7 @@ class BoardSession:
         return self._wiring
 
     def connect(self) -> None:
-        """Find every board. Raises as :meth:`Boards.connect`; then no port is left open.
+        """Find every board. Raises as :meth:`BoardGroup.connect`; then no port is left open.
 
         Until :meth:`close`, SIGTERM and SIGHUP are :class:`KeyboardInterrupt`, as Ctrl-C is, in programs that had nothing else in mind.
         """
@@ -99,19 +100,19 @@ class BoardSession:
         except BaseException:
             self.latch.leave()
             raise
-        self._endings.begin()
+        self._signals.begin()
         self.state = State.CONNECTED
 
     def configure(self) -> None:
-        """Load the calibrations; warn of a gate that is off. Raises as :func:`load_calibration`."""
+        """Load the calibrations; warn of a safety filter that is off. Raises as :func:`load_calibration`."""
         if self.state is State.DISCONNECTED:
             raise WrongState("configure", self.state, State.CONNECTED)
         if not self.config.gate.enabled:
-            LOG.warning(GATE_OFF)
+            LOG.warning(FILTER_OFF)
         self.calibrations = calibrations(self.config, self.model.arm)
-        self._gate = SafetyGate(self.model, self.config, self.calibrations)
+        self._safety_filter = SafetyFilter(self.model, self.config, self.calibrations)
         pin_mm = self.model.cell.config.block.pin_diameter_mm
-        self._wiring = Wiring(self.config, self.calibrations, pin_mm, self._gate.speed_rad_s)
+        self._wiring = Wiring(self.config, self.calibrations, pin_mm, self._safety_filter.speed_rad_s)
         self.state = State.CONFIGURED
 
     def reconnect(self) -> None:
@@ -133,19 +134,19 @@ class BoardSession:
 
     def close(self) -> None:
         """Let all ports go; servos keep their last pulse. Again is fine."""
-        with deferred():
+        with deferred_signals():
             self.boards.close()
-            if self._gate is not None:
-                self._gate.forget()
+            if self._safety_filter is not None:
+                self._safety_filter.forget()
             self.state = State.DISCONNECTED
             self.latch.leave()
-        self._endings.end()
+        self._signals.end()
 
     def wait(self, duration_s: float) -> None:
         """Wait, looking at the stop all the while. Raises :class:`Stopped`."""
         end_s = self.clock.now_s() + duration_s
         while True:
-            self.obey()
+            self.check_stop()
             left_s = end_s - self.clock.now_s()
             if left_s <= 0:
                 return
@@ -175,7 +176,7 @@ class BoardSession:
         if self.config.stream.check_reset:
             self.check_pulses()
 
-    def obey(self) -> None:
+    def check_stop(self) -> None:
         """If the stop is latched, stop every channel and raise :class:`Stopped`."""
         if self.latch.is_set():
             if self.halt():
@@ -194,11 +195,11 @@ class BoardSession:
 
         From any thread: once it returns, no move follows. Ctrl-C while it goes on waits for its end.
         """
-        with deferred(), self._writing:
+        with deferred_signals(), self._writing:
             self._halts += 1
             reached = self.boards.stop()
-            if self._gate is not None:
-                self._gate.freeze(self.clock.now_s())
+            if self._safety_filter is not None:
+                self._safety_filter.freeze(self.clock.now_s())
             if self.state in (State.ARMING, State.ARMED):
                 self.state = State.STOPPED
             return reached
@@ -207,7 +208,7 @@ class BoardSession:
         """After the stop was cleared: read back where the channels are, to 10 us, and allow moves from there.
 
         Raises :class:`Stopped` while the stop is latched, :class:`BoardReset` if a board has forgotten any channel, and
-        :class:`GateRejection` if it holds one outside its limits.
+        :class:`CommandRejected` if it holds one outside its limits.
         """
         if self.state is not State.STOPPED:
             raise WrongState("resume", self.state, State.STOPPED)
@@ -222,16 +223,16 @@ class BoardSession:
                 raise Stopped("again, meanwhile")
             self.state = State.ARMED
 
-    def limp(self) -> None:
+    def torque_off(self) -> None:
         """No more pulses: the arms sink. They have to be put into the parked pose and armed again. In a dry run nothing sinks.
 
         Raises :class:`PortLost` if a board was not reached; the others' arms sink all the same.
         """
         try:
             with self._writing, self._watched():
-                self.boards.limp()
+                self.boards.torque_off()
         finally:
-            self.gate.forget()
+            self.safety_filter.forget()
             if self.state is not State.LOST:
                 self.state = State.CONFIGURED
 
@@ -244,7 +245,7 @@ class BoardSession:
             self.state = State.LOST
             raise
         except BoardReset:
-            self.gate.forget()
+            self.safety_filter.forget()
             self.state = State.CONFIGURED
             raise
         except PulseMismatch:
@@ -259,7 +260,7 @@ class BoardSession:
         """
         with self._writing:
             self._require(needs)
-            self.obey()
+            self.check_stop()
             yield
 
     def _require(self, needs: State) -> None:
@@ -271,12 +272,75 @@ class BoardSession:
     def _refer(self, pulses: Pulses) -> list[JointCommand]:
         """Take what the boards put out for where the arms are, and return that: commands to stay there, within every joint's limits.
 
-        Raises :class:`BoardReset` if a channel has no pulse, and :class:`GateRejection` if an arm is held outside its limits.
+        Raises :class:`BoardReset` if a channel has no pulse, and :class:`CommandRejected` if an arm is held outside its limits.
         """
         require_held(pulses)
-        self.boards.stand(pulses)
-        held = [stands(self.config, self.calibrations, self.model.arm, pulses, arm) for arm in range(len(ARMS))]
+        self.boards.note_readback(pulses)
+        held = [readback_state(self.config, self.calibrations, self.model.arm, pulses, arm) for arm in range(len(ARMS))]
         stay = [JointCommand(arm, joints, fingers) for arm, (joints, fingers) in enumerate(held)]
         for command in stay:
-            self.gate.refer(*command)
+            self.safety_filter.refer(*command)
         return stay
+
+
+_ENDINGS = (signal.SIGTERM, signal.SIGHUP)
+
+
+class TerminationSignals:
+    """One session's wish that SIGTERM and SIGHUP be :class:`KeyboardInterrupt`, as Ctrl-C is: Python ends at them without another line of
+    its code, so nobody would stop the arms. Handlers that somebody has set are left alone, as is ``nohup``.
+
+    Signals reach the main thread only; in another one nothing here does anything.
+    """
+
+    def begin(self) -> None:
+        """From now on. Again is fine."""
+        if _is_main():
+            _wishes.add(self)
+            for number in _ENDINGS:
+                if signal.getsignal(number) is signal.SIG_DFL:
+                    signal.signal(number, _interrupt)
+
+    def end(self) -> None:
+        """No more, unless another session wishes it. Again is fine."""
+        _wishes.discard(self)
+        if _is_main() and not _wishes:
+            for number in _ENDINGS:
+                if signal.getsignal(number) is _interrupt:
+                    signal.signal(number, signal.SIG_DFL)
+
+
+_wishes: WeakSet[TerminationSignals] = WeakSet()
+
+
+@contextlib.contextmanager
+def deferred_signals() -> Iterator[None]:
+    """Inside, a signal that would be an exception waits; the first of them comes at the end, after an exception of the block's own too.
+
+    Handlers must not be changed inside: they are put back as they were.
+    """
+    if not _is_main():
+        yield
+        return
+    arrived: list[int] = []
+    before: dict[int, Callable[[int, FrameType | None], Any]] = {}
+    for deferrable in (signal.SIGINT, *_ENDINGS):
+        handler = signal.getsignal(deferrable)
+        if callable(handler):
+            before[deferrable] = handler
+            signal.signal(deferrable, lambda number, _: arrived.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if arrived:
+            before[arrived[0]](arrived[0], None)
+
+
+def _interrupt(number: int, _: FrameType | None) -> None:
+    raise KeyboardInterrupt(signal.Signals(number).name)
+
+
+def _is_main() -> bool:
+    return threading.current_thread() is threading.main_thread()

@@ -1,4 +1,4 @@
-"""The safety gate alone: each limit by itself, and what it says."""
+"""The safety filter alone: each limit by itself, and what it says."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from marl_handover.config import MotionConfig
 from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
 from marl_handover.hardware.calibration import nominal_calibration
 from marl_handover.hardware.clearance import FAR_MM, arm_shapes, between_mm, still
-from marl_handover.hardware.gate import GateRejection, JointCommand, Reason, SafetyGate
+from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason, SafetyFilter
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 
 PARKED = np.radians(MotionConfig().parked_deg)
@@ -21,7 +21,7 @@ PARKED = np.radians(MotionConfig().parked_deg)
 
 def made_gate(model, config=None):
     config = config or HardwareConfig()
-    gate = SafetyGate(model, config, [nominal_calibration(config, arm, model.arm) for arm in ARMS])
+    gate = SafetyFilter(model, config, [nominal_calibration(config, arm, model.arm) for arm in ARMS])
     for arm in range(2):
         gate.refer(arm, PARKED, 12.0)
     return gate
@@ -46,10 +46,10 @@ def turned(joint, degrees, fingers=12.0, arm=0, start=PARKED):
 
 def refused(gate, command, duration_s=0.06, now_s=1.0, made_s=1.0):
     commands = command if isinstance(command, list) else [command]
-    with pytest.raises(GateRejection) as caught:
+    with pytest.raises(CommandRejected) as caught:
         gate.check(commands, duration_s, now_s, made_s)
     rejection = caught.value
-    assert str(rejection).startswith(f"safety gate ({rejection.reason}): ")
+    assert str(rejection).startswith(f"safety filter ({rejection.reason}): ")
     assert rejection.limit in str(rejection)
     return rejection
 
@@ -234,7 +234,7 @@ def test_a_closed_hand_stands_parked_and_may_come_from_any_pick(model, gate):
 def test_fingers_that_are_not_named_stay_as_they_are(model, gate):
     gate.refer(0, level(model, 190.0, LEVEL_MM), 0.0)
     deep = level(model, 190.0, LEVEL_MM - 15.0)
-    with pytest.raises(GateRejection, match="block"):
+    with pytest.raises(CommandRejected, match="block"):
         gate.check_room({0: deep}, 1.0)
     gate.check_room({0: np.append(gate.held(0, 1.0)[0], 12.0)}, 1.0)
 
@@ -263,7 +263,7 @@ def test_arms_of_one_command_go_together_unless_one_may_be_stuck(model, gate):
         gate.refer(arm, reach + np.radians([turn, 0, 0, 0, 0]), 12.0)
     aims = {0: reach, 1: reach + np.radians([40.0, 0, 0, 0, 0])}
     gate.check_room(aims, 1.0)
-    with pytest.raises(GateRejection) as caught:
+    with pytest.raises(CommandRejected) as caught:
         gate.check_room(aims, 1.0, together=False)
     assert caught.value.reason is Reason.OTHER_ARM
 
@@ -337,7 +337,7 @@ def test_what_passes_is_within_every_limit(anywhere, start, changes, duration_s,
     gate.refer(0, q, 12.0)
     try:
         gate.check([JointCommand(0, target, fingers)], duration_s, 1.0, 1.0)
-    except GateRejection:
+    except CommandRejected:
         return
     assert model.arm.within_limits(target)
     assert (np.abs(target - q) <= math.radians(20.0) + 1e-6).all()

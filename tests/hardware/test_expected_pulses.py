@@ -10,23 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marl_handover.hardware.clock import VirtualClock
-from marl_handover.hardware.commanded import FRAME_S, Commanded
-from marl_handover.hardware.emulator.board import Board, Reply
-from marl_handover.hardware.emulator.device import Device
-from marl_handover.hardware.emulator.faults import make_fault
+from marl_handover.hardware.connection import State
+from marl_handover.hardware.emulator.board import EmulatedBoard
+from marl_handover.hardware.emulator.device import EmulatedDevice, make_fault
 from marl_handover.hardware.emulator.protocol_ssc32emu import mount
 from marl_handover.hardware.errors import BadReply, DeviceError, PulseMismatch, Stopped
-from marl_handover.hardware.latch import StopLatch
-from marl_handover.hardware.session import State
+from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.settings import BoardConfig, TimeoutConfig
-from marl_handover.hardware.ssc32 import Ssc32
+from marl_handover.hardware.ssc32 import FRAME_S, ExpectedPulses, Ssc32
 from marl_handover.hardware.streaming import stream
 from marl_handover.motion.trajectory import Phase
 
 
 def connected(board=None, **keywords):
     clock = VirtualClock()
-    device = Device(board or Board())
+    device = EmulatedDevice(board or EmulatedBoard())
     made = Ssc32("main", BoardConfig(mount("alone", device, clock)), TimeoutConfig(), clock, **keywords)
     made.connect()
     return made, device, clock
@@ -37,7 +35,7 @@ DEEDS = st.lists(
     st.one_of(
         st.tuples(st.just("move"), PULSES, PULSES, st.integers(1, 400)),
         st.tuples(st.just("stop")),
-        st.tuples(st.just("limp")),
+        st.tuples(st.just("torque_off")),
         st.tuples(st.just("wait"), st.floats(0.0, 0.3)),
     ),
     min_size=1,
@@ -71,13 +69,13 @@ def test_a_board_that_does_as_it_is_told_is_never_accused(deeds, speed):
 
 @given(PULSES, PULSES, st.integers(20, 400))
 def test_a_move_that_is_over_leaves_no_room(before, after, time_ms):
-    commanded = Commanded()
-    commanded.move({0: before}, 0.0, {}, 0.0, 0.0)
-    commanded.move({0: after}, time_ms / 1000, {}, 1.0, 1.01)
-    assert commanded.span(0, 1.0, 1.0).lower <= before <= commanded.span(0, 1.0, 1.0).upper
+    expected = ExpectedPulses()
+    expected.move({0: before}, 0.0, {}, 0.0, 0.0)
+    expected.move({0: after}, time_ms / 1000, {}, 1.0, 1.01)
+    assert expected.span(0, 1.0, 1.0).lower <= before <= expected.span(0, 1.0, 1.0).upper
     over_s = 1.01 + time_ms / 1000 + 0.051
-    assert commanded.span(0, over_s, over_s) == (after, after)
-    assert commanded.span(1, over_s, over_s) is None
+    assert expected.span(0, over_s, over_s) == (after, after)
+    assert expected.span(1, over_s, over_s) is None
 
 
 def swing(driver, radius_rad=0.2):
@@ -201,13 +199,13 @@ def test_a_board_that_is_late_for_once_is_waited_for(armed):
     assert rig.driver.state is State.ARMED
 
 
-class Answers(Board):
+class Answers(EmulatedBoard):
     """A board whose ``QP`` says what it is told to, over and over."""
 
     says = b"\x96"
 
     def _answer(self, text, frame):
-        return [Reply(0.0, self.says)] if text.startswith("QP") else super()._answer(text, frame)
+        return [self.says] if text.startswith("QP") else super()._answer(text, frame)
 
 
 @pytest.mark.parametrize(
