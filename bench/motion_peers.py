@@ -16,8 +16,8 @@ from marl_handover.motion.ompl_planner import STEP_RAD, OmplMissing, rrt_connect
 from marl_handover.motion.path_optimizer import FoundPath, NoPath, Segment
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.slsqp_planner import plan_slsqp
-from marl_handover.motion.splines import knots
 from marl_handover.motion.time_parametrization import time_path
+from marl_handover.motion.trajectory import knots
 
 TOLERANCE_MM, OMPL_S, REPEATS = 1.0, 5.0, 3
 

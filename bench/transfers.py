@@ -32,7 +32,7 @@ from marl_handover.motion.augmented_lagrangian import SolverOptions
 from marl_handover.motion.initial_guesses import carrying_guesses, fit_control_points, random_bend
 from marl_handover.motion.path_optimizer import NoPath, require_free_ends, solve_from
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.splines import evaluate
+from marl_handover.motion.trajectory import evaluate
 
 FILE = Path(__file__).parent / "data" / "transfers.jsonl"
 COUNT, SEED, GRASPING, LIFTED_MM = 1000, 7, 0.6, (60.0, 88.0)

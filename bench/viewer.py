@@ -41,7 +41,7 @@ from marl_handover import cli
 from marl_handover.cell import cell_config, load_cell
 from marl_handover.files import write_whole
 from marl_handover.runtime.feed import FORMAT, STATE_FILE, VERSION
-from marl_handover.viewer.units import flat
+from marl_handover.viewer.words import flat
 
 DEFAULTS = {
     "drags": 300,

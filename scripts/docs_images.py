@@ -21,7 +21,7 @@ from marl_handover.perception.detector import Detector
 from marl_handover.perception.overlay import Mark, annotated
 from marl_handover.perception.scene import CellPainter
 from marl_handover.perception.settings import MountConfig, TargetConfig
-from marl_handover.report.palette import SERIES
+from marl_handover.report.figure_style import SERIES
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "img"

@@ -46,7 +46,7 @@ LONG_WORK = (
     "marl_handover.commands.calibrate._grippers",
     "marl_handover.hardware.emulator.pty.PtyEmulator.turn",  # after the port was made
     "marl_handover.viewer.server.open_server",  # before the server listens
-    "marl_handover.report.files.save_figure",  # after the figure was made
+    "marl_handover.report.figure_style.save_figure",  # after the figure was made
 )
 """Where work that takes long begins: here a line has passed."""
 

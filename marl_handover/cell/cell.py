@@ -16,8 +16,7 @@ import numpy as np
 from marl_handover.arrays import Array, namespace, one_where
 from marl_handover.cell.arm import REACH_TOLERANCE_MM, Arm
 from marl_handover.cell.chart import Chart
-from marl_handover.cell.handover_graph import HandoverGraph
-from marl_handover.cell.shared_space import SharedSpace
+from marl_handover.cell.shared_space import HandoverGraph, SharedSpace
 from marl_handover.cell.symmetry import ARM_LETTERS, Symmetry, symmetries
 from marl_handover.config import CellConfig
 from marl_handover.errors import TwoArmsOnly, UnconnectedArms, UnequalArms

@@ -81,8 +81,7 @@ def run(config: CalibrateCommand) -> int:
 
 
 def _sheets(config: CalibrateCommand, model: CellModel) -> int:
-    from marl_handover.perception.boards import marker_sheet
-    from marl_handover.perception.sheets import PX_PER_MM, page, save_sheet, write_sheets
+    from marl_handover.perception.sheets import PX_PER_MM, marker_sheet, page, save_sheet, write_sheets
 
     folder, cards, target = config.folder() / "sheets", config.cards, config.target
     files = write_sheets(folder, model.cell.config.block, target, config.board, config.paper)

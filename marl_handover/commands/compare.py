@@ -139,7 +139,7 @@ def _report(suite: Suite, whole: Suite, tasks: Sequence[Task], failures: dict[st
     from marl_handover.compare.tables import csv_text, make_tables, markdown
     from marl_handover.files import write_whole
     from marl_handover.report.compare import make_figures
-    from marl_handover.report.files import save_figure, write_json
+    from marl_handover.report.figure_style import save_figure, write_json
 
     results = gather(suite, tasks, failures, whole)
     figures = dict(make_figures(results))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from marl_handover.errors import WorkFailed
 
 if TYPE_CHECKING:
-    from marl_handover.perception.boards import Sheet
+    from marl_handover.perception.sheets import Sheet
     from marl_handover.runtime.settings import CardConfig
 
 

@@ -72,7 +72,7 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: PlanConfig) -> int:
     """Solve, print, write. Raises :class:`WorkFailed` if the policy does not reach the goal."""
-    from marl_handover.report.files import require_picture, save_figure, write_json
+    from marl_handover.report.figure_style import require_picture, save_figure, write_json
 
     for name in ("picture", "motion_picture"):
         if getattr(config, name):
@@ -114,7 +114,7 @@ def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> N
         NoMotion: if one of them has no collision-free motion; then nothing is written.
     """
     from marl_handover.motion.coordination import coordinate
-    from marl_handover.report.files import save_figure, write_json
+    from marl_handover.report.figure_style import save_figure, write_json
     from marl_handover.runtime.motions import motion_row, plan_motions
 
     planner.warm_up()

@@ -43,7 +43,7 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: PlotConfig) -> int:
     """Draw one figure, or those of a suite, and say where it is."""
-    from marl_handover.report.files import require_picture, save_figure
+    from marl_handover.report.figure_style import require_picture, save_figure
 
     check_bounds(config)
     whole_suite = config.kind == "compare" and not config.figure
@@ -95,7 +95,7 @@ def _run(config: PlotConfig) -> tuple[Figure, Path]:
 
 def _workspace(config: PlotConfig) -> tuple[Figure, Path]:
     from marl_handover.cell import build_cell
-    from marl_handover.report.workspace import workspace_figure
+    from marl_handover.report.plan import workspace_figure
 
     return workspace_figure(build_cell(config.cell or CellConfig())), Path("runs/workspace/workspace.png")
 
@@ -165,7 +165,7 @@ def _errors(config: PlotConfig) -> tuple[Figure, Path]:
 
 
 def _confusion(config: PlotConfig) -> tuple[Figure, Path]:
-    from marl_handover.report.confusion import endings_against, meant_figure
+    from marl_handover.report.errors import endings_against, meant_figure
 
     (path, trace), *more = _traces(config, 2)
     default = path.with_name(f"{path.stem}_confusion.png")
@@ -208,7 +208,7 @@ def _suite_figure(config: PlotConfig) -> tuple[Figure, Path]:
 
 def _whole_suite(config: PlotConfig) -> int:
     """All figures of a suite, each as PNG and PDF."""
-    from marl_handover.report.files import save_figure
+    from marl_handover.report.figure_style import save_figure
 
     folder, figures = _suite(config)
     out = Path(config.out) if config.out else folder / "figures"

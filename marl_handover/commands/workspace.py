@@ -31,8 +31,8 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: WorkspaceConfig) -> int:
     """Compute the cell, write both files, print the summary."""
-    from marl_handover.report.files import save_figure, write_json
-    from marl_handover.report.workspace import workspace_figure
+    from marl_handover.report.figure_style import save_figure, write_json
+    from marl_handover.report.plan import workspace_figure
 
     model = build_cell(config.cell)
     summary = workspace_summary(model)

@@ -13,9 +13,8 @@ from marl_handover.compose import to_yaml
 from marl_handover.config import CentralisedConfig, MotionConfig, TaskConfig
 from marl_handover.envs.cycle_check import LENGTH_SAMPLES, CycleCheck
 from marl_handover.errors import InvalidSetting
-from marl_handover.motion.batched_collision import MotionCheck
-from marl_handover.motion.batched_paths import MotionNumbers, ends_of
-from marl_handover.motion.splines import sampled_basis
+from marl_handover.motion.batched_paths import MotionCheck, MotionNumbers, ends_of
+from marl_handover.motion.trajectory import sampled_basis
 from marl_handover.task.rules import Command, Rules
 
 

@@ -11,8 +11,7 @@ from marl_handover.envs.cycle_check import CycleCheck
 from marl_handover.motion.executor import ROLL_RAD
 from marl_handover.motion.path_optimizer import DENSE_SAMPLES, Segment
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.motion.splines import sampled_basis
-from marl_handover.motion.trajectory import PickPlacePaths
+from marl_handover.motion.trajectory import PickPlacePaths, sampled_basis
 
 Floats = NDArray[np.float64]
 

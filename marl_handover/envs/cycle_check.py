@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
-from marl_handover.motion.splines import knots, sampled_basis
-from marl_handover.motion.trajectory import PickPlacePaths
+from marl_handover.motion.trajectory import PickPlacePaths, knots, sampled_basis
 
 Floats = NDArray[np.float64]
 

@@ -8,6 +8,7 @@ turns the block about the hand's own axis, which only brings it nearer to the ta
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,12 +18,257 @@ from marl_handover.arrays import select
 from marl_handover.cell import Cell
 from marl_handover.cell.build import CellModel
 from marl_handover.config import CentralisedConfig, MotionConfig
-from marl_handover.geometry.closed_form import planar_ik
-from marl_handover.motion.batched_collision import Ends
-from marl_handover.motion.collision_model import arm_collision_model
+from marl_handover.geometry.capsules import segment_distance
+from marl_handover.geometry.closed_form import pitch_frames, planar_ik
+from marl_handover.motion.collision_model import arm_collision_model, out_of_reach
 from marl_handover.motion.initial_guesses import GRIP_LEAST_MM, RUN_UP_MM, SAMPLES, WRIST_LEAST_MM
-from marl_handover.motion.splines import sample_places, sampled_basis
+from marl_handover.motion.objective import first_moving
+from marl_handover.motion.planner import STILL_MM, MotionPlanner
+from marl_handover.motion.trajectory import basis, sample_places, sampled_basis
 from marl_handover.motion.transfer_features import JOINTS
+
+CHUNK = 1024
+"""Rows judged together: their samples stay in the processor's cache."""
+
+CROWDING = 0.6
+"""Samples are denser towards both ends, where a block is near the table; see :func:`marl_handover.motion.initial_guesses.sample_places`."""
+
+ROUNDING_MM = 0.03
+"""A block on the table may be this much in it: single precision, and poses at the edge of the reach, which are some 20 um off."""
+
+LIMIT_RAD = 1e-5
+"""Joints may pass a limit by single precision's rounding."""
+
+FAR_MM = 1e9
+
+
+class Ends(NamedTuple):
+    """Both ends of transfers, seen from the base of the arm that makes them: ``radius_mm`` and ``yaw_rad``, both (n, 2), from and to."""
+
+    radius_mm: Tensor
+    yaw_rad: Tensor
+
+    @property
+    def places_mm(self) -> Tensor:
+        """(n, 2, 2): x, y in the arm's base frame of from and to."""
+        return torch.stack([self.radius_mm * self.yaw_rad.cos(), self.radius_mm * self.yaw_rad.sin()], -1)
+
+    def share(self, lift_scale_mm: float) -> Tensor:
+        """Part (n,) of the demanded heights that a short way is asked for, as the executors' planner has it."""
+        start, end = self.places_mm.unbind(-2)
+        distance = (end - start).square().sum(-1).sqrt()
+        return (distance.clamp_min(STILL_MM) / (2 * lift_scale_mm)).clamp_max(1.0)
+
+
+class Frames(NamedTuple):
+    """Pivot (r, z) and (cos, sin) of the pitch of every level, each (..., 5), and (cos, sin) of the yaw, each (...)."""
+
+    r: Tensor
+    z: Tensor
+    cos: Tensor
+    sin: Tensor
+    cos_yaw: Tensor
+    sin_yaw: Tensor
+
+    def at(self, level: int, x: float, z: float) -> tuple[Tensor, Tensor]:
+        """A point (x, z) of a level's frame as (r, z) in mm."""
+        cos, sin = self.cos[..., level], self.sin[..., level]
+        return self.r[..., level] + cos * x - sin * z, self.z[..., level] + sin * x + cos * z
+
+    def rows(self, index: Tensor) -> Frames:
+        """Those of flat sample numbers (m,)."""
+        return Frames(*(part.flatten(0, 1)[index] for part in self))
+
+
+class MotionCheck:
+    """Which motions an arm may make with the block in its hand.
+
+    Args:
+        model: the cell.
+        motion: clearances and the parked pose.
+        settings: control points, degree and samples of the splines.
+
+    Raises:
+        InvalidSetting: on a motion setting out of its limits.
+    """
+
+    def __init__(self, model: CellModel, motion: MotionConfig, settings: CentralisedConfig) -> None:
+        planner = MotionPlanner(model, motion)
+        body = planner.collision_model
+        self.motion = motion
+        self.planar, self.capsules, self.edges = body.planar, body.held, body.edges
+        self.carried, self.first = len(body.capsules), int(first_moving(body.held))
+        self.pairs = [(int(one), int(other)) for one, other in body.held_pairs]
+        self.link_balls = self._balls_of_links()
+        # What the planner sets around the path of a loaded hand; the middle of the shared space is in every arm's reach.
+        scenes = [planner.carrying(arm, np.zeros(2), np.zeros(2), planner.home_rad)[0].scene for arm in range(model.cell.num_arms)]
+        others = np.stack([scene.obstacles for scene in scenes])
+        others = others[:, ~np.all([out_of_reach(body, rows) for rows in others], axis=0)]
+        self.constants = {
+            "basis": basis(sample_places(settings.samples, CROWDING), settings.control_points, settings.degree),
+            "limits": body.limits,
+            "capsules": body.held,
+            "pairs": body.held_pairs,
+            "obstacles": others,
+        }
+        self._placed: dict[torch.device, dict[str, Tensor]] = {}
+
+    @torch.no_grad()
+    def passes(self, arm: Tensor, points: Tensor, ends: Ends) -> Tensor:
+        """Whether motions are allowed, bool (n,).
+
+        Args:
+            arm: int (n,), who makes them.
+            points: (n, N, 4) control points in rad, wrist roll 0 left out; the first and the last are the joints at the ends.
+            ends: of the transfers.
+        """
+        parts = [self._passes(*(part[first : first + CHUNK] for part in (arm, points, *ends))) for first in range(0, len(arm), CHUNK)]
+        return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.bool, device=arm.device)
+
+    def _passes(self, arm: Tensor, points: Tensor, radius_mm: Tensor, yaw_rad: Tensor) -> Tensor:
+        known = self._constants(points.device)
+        joints = torch.einsum("sp,npj->nsj", known["basis"], points.float())
+        low, high = known["limits"].unbind(-1)
+        good = ((points >= low - LIMIT_RAD) & (points <= high + LIMIT_RAD)).all(-1).all(-1)
+        frames = self._frames(joints)
+        good &= self._heights(frames, Ends(radius_mm.float(), yaw_rad.float()))
+        for judge in (self._itself, self._others):
+            left = good.nonzero()[:, 0]
+            if len(left):
+                some = frames if len(left) == len(good) else Frames(*(part[left] for part in frames))
+                good[left] = judge(some, arm[left], known)
+        return good
+
+    def _frames(self, joints: Tensor) -> Frames:
+        """Of joint samples (n, S, 4)."""
+        r, z, cos, sin = pitch_frames(self.planar, joints)
+        standing = torch.zeros_like(r[..., :2])  # base and turret do not pitch
+        r, z, cos, sin = (torch.cat(pair, -1) for pair in ((standing, r), (standing, z), (standing + 1, cos), (standing, sin)))
+        return Frames(r, z, cos, sin, joints[..., 0].cos(), joints[..., 0].sin())
+
+    def _heights(self, frames: Frames, ends: Ends) -> Tensor:
+        """Whether every moving body is clear of the table, and the block's lower edges as high as they must be, bool (n,)."""
+        lowest = torch.full_like(frames.cos_yaw, FAR_MM)
+        for row in self.capsules[self.first : self.carried]:
+            for x, z in ((row[1], row[3]), (row[4], row[6])):
+                lowest = torch.minimum(lowest, frames.at(int(row[0]), x, z)[1] - (row[7] + self.motion.ground_clearance_mm))
+        r, _ = frames.at(4, self.planar[6], self.planar[7])
+        share = ends.share(self.motion.lift_scale_mm)
+        ramp = torch.ones_like(r)
+        for place in ends.places_mm.unbind(-2):
+            away = (r * frames.cos_yaw - place[:, None, 0]).square() + (r * frames.sin_yaw - place[:, None, 1]).square()
+            ramp = ramp * (1 - (-away / (share * self.motion.lift_scale_mm).square()[:, None]).exp())
+        asked = (share * self.motion.ground_clearance_mm)[:, None] * ramp - ROUNDING_MM
+        for x, z in self.edges:
+            lowest = torch.minimum(lowest, frames.at(4, x, z)[1] - asked)
+        return (lowest >= 0).all(-1)
+
+    def _itself(self, frames: Frames, arm: Tensor, known: dict[str, Tensor]) -> Tensor:
+        """Whether the arm and what it holds keep clear of itself, bool (n,)."""
+        clearance = self.motion.self_clearance_mm
+        middles = [frames.at(int(row[0]), (row[1] + row[4]) / 2, (row[3] + row[6]) / 2) for row in self.capsules]
+        close = []
+        for one, other in self.pairs:
+            (r_1, z_1), (r_2, z_2), first, second = middles[one], middles[other], self.capsules[one], self.capsules[other]
+            away = first[7] + second[7] + first[8] + second[8] + clearance
+            aside = (first[2] + first[5] - second[2] - second[5]) / 2
+            close.append((r_1 - r_2).square() + (z_1 - z_2).square() <= away**2 - aside**2)
+        if not close:
+            return torch.ones_like(arm, dtype=torch.bool)
+        pair, sample = torch.stack(close).flatten(1).nonzero().unbind(-1)
+        some = frames.rows(sample)
+        first, second = (_segments(some, known["capsules"][known["pairs"][pair, which]][:, None])[:, 0] for which in range(2))
+        return _none_of(sample[nearer(first, second, clearance)], frames)
+
+    def _others(self, frames: Frames, arm: Tensor, known: dict[str, Tensor]) -> Tensor:
+        """Whether the moving arm and what it holds keep clear of the parked ones, bool (n,)."""
+        ball = known["balls"][arm][:, None]
+        near = torch.zeros_like(frames.cos_yaw, dtype=torch.bool)
+        for level, x, z, radius in self.link_balls:
+            r, height = frames.at(level, x, z)
+            away = (r * frames.cos_yaw - ball[..., 0]).square() + (r * frames.sin_yaw - ball[..., 1]).square()
+            near |= away + (height - ball[..., 2]).square() <= (ball[..., 3] + radius).square()
+        sample = near.flatten().nonzero()[:, 0]
+        some = frames.rows(sample)
+        capsules = known["capsules"][self.first :]
+        moving = _segments(some, capsules.expand(len(sample), *capsules.shape))
+        standing = _turned(known["obstacles"][arm[_row(sample, frames)]], some.cos_yaw, some.sin_yaw)
+        shape = (len(sample), moving.shape[1], standing.shape[1], 8)
+        first, second = moving[:, :, None].expand(shape), standing[:, None].expand(shape)
+        clearance = self.motion.arm_clearance_mm
+        middle = (first[..., :3] + first[..., 3:6] - second[..., :3] - second[..., 3:6]) / 2
+        away = first[..., 6] + second[..., 6] + first[..., 7] + second[..., 7] + clearance
+        close = (middle.square().sum(-1) <= away.square()).nonzero()
+        index = close.unbind(-1)
+        return _none_of(sample[close[nearer(first[index], second[index], clearance), 0]], frames)
+
+    def _balls_of_links(self) -> list[tuple[int, float, float, float]]:
+        """Level, (x, z) in its frame and radius in mm of a ball around each moving link."""
+        balls = []
+        for level in sorted({int(level) for level in self.capsules[self.first :, 0]}):
+            rows = self.capsules[self.capsules[:, 0] == level]
+            points = rows[:, 1:7].reshape(-1, 3)
+            centre = (points.min(axis=0) + points.max(axis=0)) / 2 * np.array([1.0, 0.0, 1.0])
+            away = np.linalg.norm(rows[:, 1:7].reshape(-1, 2, 3) - centre, axis=-1).max(axis=1) + rows[:, 7]
+            balls.append((level, float(centre[0]), float(centre[2]), float(away.max())))
+        return balls
+
+    def _constants(self, device: torch.device) -> dict[str, Tensor]:
+        """The packed geometry on a device; made once for each."""
+        if device not in self._placed:
+            placed: dict[str, Tensor] = {}
+            for name, value in self.constants.items():
+                kind: Any = torch.int64 if name == "pairs" else torch.float32
+                placed[name] = torch.as_tensor(np.asarray(value), dtype=kind, device=device)
+            placed["balls"] = torch.stack([_ball_around(rows) for rows in placed["obstacles"]])
+            self._placed[device] = placed
+        return self._placed[device]
+
+
+def nearer(first: Tensor, second: Tensor, clearance_mm: float) -> Tensor:
+    """Whether segments (m, 8), see :func:`_segments`, are nearer to each other than their radii and the clearance allow, bool (m,)."""
+    one, other = first.double(), second.double()
+    return segment_distance(one[:, :3], one[:, 3:6], other[:, :3], other[:, 3:6]) < one[:, 6] + other[:, 6] + clearance_mm
+
+
+def _segments(frames: Frames, capsules: Tensor) -> Tensor:
+    """Placed capsules (m, K, 8): both ends (r, t, z), radius, half the length; of flat samples (m,) and capsule rows (m, K, 9)."""
+    level = capsules[..., 0].long()
+    r, z, cos, sin = (part.gather(1, level) for part in (frames.r, frames.z, frames.cos, frames.sin))
+    columns = []
+    for x, t, height in (capsules[..., 1:4].unbind(-1), capsules[..., 4:7].unbind(-1)):
+        columns += [r + cos * x - sin * height, t, z + sin * x + cos * height]
+    return torch.stack([*columns, capsules[..., 7], capsules[..., 8]], -1)
+
+
+def _row(sample: Tensor, frames: Frames) -> Tensor:
+    """The motions to which flat sample numbers belong."""
+    return torch.div(sample, frames.cos_yaw.shape[1], rounding_mode="floor")
+
+
+def _none_of(sample: Tensor, frames: Frames) -> Tensor:
+    """Which motions have none of these flat samples, bool (n,)."""
+    good = torch.ones(len(frames.cos_yaw), dtype=torch.bool, device=sample.device)
+    good[_row(sample, frames)] = False
+    return good
+
+
+def _turned(obstacles: Tensor, cos_yaw: Tensor, sin_yaw: Tensor) -> Tensor:
+    """Obstacle rows (m, M, 9) as segments (m, M, 8) in the plane of an arm turned by a yaw, (m,)."""
+    cos, sin = cos_yaw[:, None], sin_yaw[:, None]
+    columns = []
+    for x, y, z in (obstacles[..., 0:3].unbind(-1), obstacles[..., 3:6].unbind(-1)):
+        columns += [cos * x + sin * y, cos * y - sin * x, z]
+    return torch.stack([*columns, obstacles[..., 6], obstacles[..., 8]], -1)
+
+
+def _ball_around(obstacles: Tensor) -> Tensor:
+    """A ball (x, y, z, radius) in mm around obstacle rows (M, 9), the clearance they demand included."""
+    points = obstacles[:, :6].reshape(-1, 2, 3)
+    centre = (points.amin((0, 1)) + points.amax((0, 1))) / 2
+    away = (points - centre).square().sum(-1).sqrt().amax(1) + obstacles[:, 6] + obstacles[:, 7]
+    return torch.cat([centre, away.amax()[None]])
+
 
 END_WEIGHT, END_WIDTH = 100.0, 0.08
 """How much more the ends of the straight guess weigh when few control points are fitted to it, and how far into the path.

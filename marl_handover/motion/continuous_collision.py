@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from marl_handover.compiled import compiled
 from marl_handover.motion.collision_model import Scene
 from marl_handover.motion.path_optimizer import Segment
-from marl_handover.motion.splines import knots
+from marl_handover.motion.trajectory import knots
 from marl_handover.motion.validation import dense_margins
 
 Floats = NDArray[np.float64]

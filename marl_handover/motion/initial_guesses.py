@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from marl_handover.geometry.kernels import elbow_up
 from marl_handover.motion.collision_model import CollisionModel
-from marl_handover.motion.splines import basis, sample_places, sampled_basis
+from marl_handover.motion.trajectory import basis, sample_places, sampled_basis
 
 Floats = NDArray[np.float64]
 

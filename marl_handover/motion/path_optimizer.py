@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from marl_handover.motion.augmented_lagrangian import SolverOptions, Spline, minimize
 from marl_handover.motion.collision_model import MARGIN_MM, CollisionModel, Scene, ball_around, out_of_reach
 from marl_handover.motion.initial_guesses import fit_control_points, random_bend, smoothing_metric
-from marl_handover.motion.splines import basis, sample_places, sampled_basis
-from marl_handover.motion.trajectory import NoPath
+from marl_handover.motion.trajectory import NoPath, basis, sample_places, sampled_basis
 from marl_handover.motion.validation import ROUNDING_MM, Margins, dense_margins
 
 Floats = NDArray[np.float64]

@@ -24,7 +24,7 @@ from marl_handover.geometry.closed_form import grip_in_plane, grip_speed
 from marl_handover.geometry.kernels import elbow_up
 from marl_handover.motion.collision_model import Scene
 from marl_handover.motion.path_optimizer import DENSE_SAMPLES, FoundPath, NoPath, Segment, require_free_ends
-from marl_handover.motion.splines import sampled_basis
+from marl_handover.motion.trajectory import sampled_basis
 from marl_handover.motion.validation import dense_margins
 
 Floats = NDArray[np.float64]

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from marl_handover.perception.boards import board_corners_mm, charuco_board
 from marl_handover.perception.calibration import CalibrationFailed, Floats, Intrinsics, Pixels
 from marl_handover.perception.settings import BoardConfig
+from marl_handover.perception.sheets import board_corners_mm, charuco_board
 from marl_handover.wording import counted
 
 LEAST_VIEWS, LEAST_CORNERS = 8, 8

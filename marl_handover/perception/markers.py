@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from marl_handover.perception.boards import dictionary
 from marl_handover.perception.calibration import Floats, Pixels
+from marl_handover.perception.sheets import dictionary
 
 PLAIN, OPENED = "plain", "opened"
 

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from marl_handover.errors import CorruptFile
-from marl_handover.report.palette import BLUE, FAINT, GREY, OUTCOMES, PAPER, YELLOW
+from marl_handover.report.figure_style import BLUE, FAINT, GREY, OUTCOMES, PAPER, YELLOW
 from marl_handover.report.table import Axes
 from marl_handover.wording import counted
 

@@ -18,7 +18,7 @@ from marl_handover.config import MotionConfig
 from marl_handover.errors import CorruptFile, InvalidSetting
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.trajectory import LOADED_PHASES, PHASES, Phase, PickPlacePaths, TransferMotion
-from marl_handover.report.palette import BLUE, FAINT, GREY, INK, PAPER, RED, YELLOW, arm_colour
+from marl_handover.report.figure_style import BLUE, FAINT, GREY, INK, PAPER, RED, YELLOW, arm_colour
 from marl_handover.report.table import Axes, draw_bases, draw_sectors, frame_table
 from marl_handover.runtime.motions import clearances_mm, grip_mm
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.report.palette import FAINT, INK, PAPER, arm_colour, arm_line
+from marl_handover.report.figure_style import FAINT, INK, PAPER, arm_colour, arm_line
 
 Axes = Any
 """matplotlib's, which has no types of its own here."""

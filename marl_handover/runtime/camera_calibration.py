@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from marl_handover.hardware.clock import Clock
-from marl_handover.perception.boards import Sheet, charuco_sheet
 from marl_handover.perception.calibration import CameraCalibration, Pixels
 from marl_handover.perception.camera import Camera
 from marl_handover.perception.intrinsics import calibrate_lens
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
 from marl_handover.perception.settings import BoardConfig
+from marl_handover.perception.sheets import Sheet, charuco_sheet
 
 PLACES = ((0.0, 0.0, 0.0), (-90.0, 20.0, math.pi / 2), (90.0, -20.0, -math.pi / 2))
 """Where the board is laid, x_mm, y_mm, yaw_rad of its middle: between them they cover the shared part of the table."""

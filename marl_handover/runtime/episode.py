@@ -26,9 +26,9 @@ def moved(before: Floats, after: Floats, same_mm: float = SAME_MM, same_rad: flo
 class Done(NamedTuple):
     """What came of an order to an arm.
 
-    ``pose`` (3,) measured afterwards; ``refusal``: a value of :class:`~marl_handover.envs.cycle_check.Refusal`, or None; ``detail``: the
-    arm's words about it; ``planning_ms``; ``duration_s`` and ``path_mm`` of the motion, 0 if there was none; ``truth`` (3,): where the
-    object truly is then, None where nobody knows better than ``pose``.
+    ``pose`` (3,) measured afterwards; ``refusal``: a value of :class:`~marl_handover.envs.cycle_check.Refusal`, or None;
+    ``detail``: the arm's words about it; ``planning_ms``; ``duration_s`` and ``path_mm`` of the motion, 0 if there was none;
+    ``truth`` (3,): where the object truly is then, None where nobody knows better than ``pose``.
     """
 
     pose: Floats

@@ -17,10 +17,10 @@ from marl_handover.config import MotionConfig
 from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.emulator.device import EmulatedCell, Fault
-from marl_handover.perception.boards import Sheet, marker_sheet
 from marl_handover.perception.calibration import Pixels, hung_camera
 from marl_handover.perception.camera import Frame, RenderedCamera
 from marl_handover.perception.scene import CellPainter, held_boards
+from marl_handover.perception.sheets import Sheet, marker_sheet
 from marl_handover.runtime.reach import drawn_in
 from marl_handover.runtime.settings import LabConfig
 from marl_handover.simulation.arm import SERVO_S

@@ -19,7 +19,7 @@ import marl_handover
 from marl_handover import cli, progress
 from marl_handover.commands import calibrate, compare, evaluate, plan, run, simulate, train, tune, view
 from marl_handover.files import cache_folder
-from marl_handover.report.files import save_figure
+from marl_handover.report.figure_style import save_figure
 
 
 def _marl_handover(folder, *arguments, **env):

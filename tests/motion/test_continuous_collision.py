@@ -7,7 +7,7 @@ import pytest
 
 from marl_handover.motion.continuous_collision import certify
 from marl_handover.motion.initial_guesses import fit_control_points
-from marl_handover.motion.splines import evaluate
+from marl_handover.motion.trajectory import evaluate
 from tests.motion.test_motion_planner import place
 
 OTHER = np.array([-0.3, 1.0, -2.2, 1.2, 0.0])

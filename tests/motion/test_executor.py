@@ -11,7 +11,7 @@ from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.errors import UnknownChoice
 from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
-from marl_handover.motion.splines import evaluate
+from marl_handover.motion.trajectory import evaluate
 
 MOTION = MotionConfig()
 PARKED = np.radians(MOTION.parked_deg)

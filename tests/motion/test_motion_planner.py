@@ -18,8 +18,7 @@ from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_
 from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.motion.path_optimizer import NoPath
 from marl_handover.motion.planner import MotionPlanner, string_length
-from marl_handover.motion.splines import evaluate
-from marl_handover.motion.trajectory import PHASES, OutOfArmsReach
+from marl_handover.motion.trajectory import PHASES, OutOfArmsReach, evaluate
 
 
 def place(model, arm, r, yaw):

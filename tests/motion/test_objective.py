@@ -9,7 +9,7 @@ from marl_handover.geometry.capsules import segment_distance
 from marl_handover.motion.initial_guesses import fit_control_points
 from marl_handover.motion.objective import Penalty, columns, lagrangian, ramp
 from marl_handover.motion.path_optimizer import WEIGHTS
-from marl_handover.motion.splines import evaluate
+from marl_handover.motion.trajectory import evaluate
 from tests.geometry.test_kernels import placed
 
 OTHER = np.array([0.3, 1.0, -2.2, 1.2, 0.0])

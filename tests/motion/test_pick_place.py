@@ -17,8 +17,7 @@ from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.pick_place import LIFTED_MM, timed_phases
-from marl_handover.motion.splines import basis
-from marl_handover.motion.trajectory import PHASES, Phase, PickPlacePaths
+from marl_handover.motion.trajectory import PHASES, Phase, PickPlacePaths, basis
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from marl_handover.cell import build_cell, cell_config
 from marl_handover.motion.path_optimizer import NoPath, Segment
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.slsqp_planner import first_guess, grip_speed, plan_slsqp, sample_margins, solve
-from marl_handover.motion.splines import evaluate
+from marl_handover.motion.trajectory import evaluate
 
 TAU = np.linspace(0.0, 1.0, 1001)
 

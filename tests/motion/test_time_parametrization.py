@@ -15,9 +15,8 @@ from scipy.spatial import cKDTree
 from toppra import constraint
 
 from marl_handover.errors import InvalidSetting, NotFinite
-from marl_handover.motion.splines import evaluate, knots
 from marl_handover.motion.time_parametrization import time_path
-from marl_handover.motion.trajectory import JointTrajectory
+from marl_handover.motion.trajectory import JointTrajectory, evaluate, knots
 
 Floats = NDArray[np.float64]
 

@@ -8,8 +8,7 @@ from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.calibration import CameraCalibration, Intrinsics, looking_down
-from marl_handover.perception.renderer import Renderer, Shape
-from marl_handover.perception.scene import CellPainter
+from marl_handover.perception.scene import CellPainter, Renderer, Shape
 from marl_handover.perception.settings import LookConfig
 from marl_handover.simulation.engine import length, pybullet
 from marl_handover.simulation.world import BulletCell

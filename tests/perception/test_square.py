@@ -5,8 +5,7 @@ import pytest
 
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.detector import Detector
-from marl_handover.perception.renderer import Renderer
-from marl_handover.perception.scene import block_shapes
+from marl_handover.perception.scene import Renderer, block_shapes
 from marl_handover.perception.settings import LookConfig, TargetConfig
 
 RED, GREEN = (40.0, 35.0, 205.0), (60.0, 180.0, 50.0)

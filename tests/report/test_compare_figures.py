@@ -7,9 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from marl_handover.report.compare import curves_figure, make_figures, profiles_figure
-from marl_handover.report.compare_bars import KINDS, bars_figure, endings_figure, kind_of
-from marl_handover.report.palette import SERIES, SERIES_LINES, series_style
+from marl_handover.report.compare import KINDS, bars_figure, curves_figure, endings_figure, kind_of, make_figures, profiles_figure
+from marl_handover.report.figure_style import SERIES, SERIES_LINES, series_style
 
 OUTCOMES = ("success", "wrong_orientation", "wrong_position", "timeout")
 

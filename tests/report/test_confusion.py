@@ -8,7 +8,7 @@ import pytest
 from marl_handover.cell import load_cell
 from marl_handover.config import TaskChanges, TaskConfig
 from marl_handover.errors import InvalidSetting
-from marl_handover.report.confusion import endings_against, meant_figure
+from marl_handover.report.errors import endings_against, meant_figure
 from marl_handover.report.traces import read_trace
 from marl_handover.runtime.assessment import AssessmentConfig, assess
 from marl_handover.task.rules import Outcome, Rules

@@ -10,8 +10,7 @@ from marl_handover.commands.plan import solve
 from marl_handover.policies import adapted
 from marl_handover.report.evaluation import evaluation_figure
 from marl_handover.report.learning import learning_figure
-from marl_handover.report.plan import plan_figure
-from marl_handover.report.workspace import workspace_figure
+from marl_handover.report.plan import plan_figure, workspace_figure
 
 
 @pytest.mark.parametrize("name", ["paper", "al5a"])

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from marl_handover.motion.splines import evaluate
 from marl_handover.motion.time_parametrization import time_path
-from marl_handover.motion.trajectory import JointTrajectory, still
+from marl_handover.motion.trajectory import JointTrajectory, evaluate, still
 from marl_handover.runtime.interactive.tracks import DELAYS, STEP_S, joined, stopped
 
 VELOCITY = np.array([4.6, 3.6, 3.6, 4.2, 7.6])

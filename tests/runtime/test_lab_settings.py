@@ -7,8 +7,8 @@ import pytest
 
 from marl_handover.cli import main
 from marl_handover.errors import InvalidSetting
-from marl_handover.perception.boards import dictionary
 from marl_handover.perception.settings import MARKERS, CameraConfig, TargetConfig
+from marl_handover.perception.sheets import dictionary
 from marl_handover.runtime.settings import CardConfig, LabConfig, twin_lab
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from marl_handover.config import BlockConfig
-from marl_handover.simulation.block import _beads_mm, _mass_properties
+from marl_handover.simulation.world import _beads_mm, _mass_properties
 
 
 def test_mass_and_inertia_agree_with_a_sum_over_voxels():

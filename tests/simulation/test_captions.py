@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import ImageColor
 
 from marl_handover.palette import OUTCOMES, arm_colour
-from marl_handover.simulation.captions import Caption, band_px, captioned
+from marl_handover.simulation.film import Caption, band_px, captioned
 
 SIZES = [(640, 360), (640, 480), (320, 240), (1280, 720), (480, 480), (360, 640)]
 WIDEST = Caption(88, 1, True, 888.8, -math.radians(178.8), "wrong_orientation")

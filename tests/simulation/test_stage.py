@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from marl_handover.simulation.stage import dress
+from marl_handover.simulation.film import dress
 
 
 def at(image, x_mm, y_mm):

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marl_handover.geometry.se3 import transform
-from marl_handover.viewer.arms import ArmNodes
+from marl_handover.viewer.scene import ArmNodes
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from marl_handover.hardware.estop import StopLatch
 from marl_handover.runtime.feed import EVENTS_FILE, STATE_FILE, Feed, Reading
 from marl_handover.runtime.steering import Ask
 from marl_handover.task.rules import Command, Rules
-from marl_handover.viewer import live_words
+from marl_handover.viewer import live as live_words
 from marl_handover.viewer.live import LivePage, _picking
 from marl_handover.viewer.scene import CellScene
 

@@ -18,7 +18,7 @@ from viser import _messages
 from websockets.exceptions import InvalidStatus
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.viewer import guard
+from marl_handover.viewer import server as guard
 from marl_handover.viewer.server import PortTaken, address, keep_updating, open_server
 
 

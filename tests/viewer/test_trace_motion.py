@@ -7,8 +7,8 @@ import pytest
 
 from marl_handover.cell.symmetry import LEFT
 from marl_handover.runtime.interactive.body import lying
+from marl_handover.viewer.trace import Motions
 from marl_handover.viewer.trace_file import Recorded, Step
-from marl_handover.viewer.trace_motion import Motions
 
 START = np.array([-160.0, 90.0, 0.5])
 PLACE = np.array([-60.0, 0.0])

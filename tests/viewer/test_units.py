@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from marl_handover.viewer.units import UPWARDS, flat, metres, product, quaternion, rgb, turned, yaw_of
+from marl_handover.viewer.words import UPWARDS, flat, metres, product, quaternion, rgb, turned, yaw_of
 
 angles = st.floats(-math.pi, math.pi)
 turns = st.tuples(angles, angles, angles).map(lambda euler: Rotation.from_euler("xyz", euler))

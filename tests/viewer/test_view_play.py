@@ -13,8 +13,7 @@ from marl_handover import policies
 from marl_handover.runtime.interactive.cell import InteractiveCell
 from marl_handover.viewer.play import PlayPage
 from marl_handover.viewer.server import address, keep_updating
-from marl_handover.viewer.units import flat
-from marl_handover.viewer.words import plain
+from marl_handover.viewer.words import flat, plain
 
 EVIL = "<img src=x onerror=alert(1)> ![x](http://somewhere/x.png)"
 SEEN_S = 30.0

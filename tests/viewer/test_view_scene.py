@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from marl_handover.palette import ALERT, ARMS, GOAL
 from marl_handover.viewer.scene import CellScene, place_names
-from marl_handover.viewer.units import rgb
+from marl_handover.viewer.words import rgb
 
 JOINTS = np.array([[0.1, 1.0, -2.0, 0.5, 0.0], [0.0, 2.0, -2.0, 0.3, 0.0]])
 PLAN = np.array([[30.0, 0.0, 1.0], [-60.0, 20.0, 0.3], [150.0, -80.0, 2.0]])

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from marl_handover.viewer.table import add_table, chart_lines, sector_outline, shared_mesh
+from marl_handover.viewer.scene import add_table, chart_lines, sector_outline, shared_mesh
 
 INNER = 0.999  # a little off the edges, where floats decide
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from marl_handover.errors import CannotWrite, CorruptFile, InvalidSetting, MissingFile
 from marl_handover.parsing import read_json
-from marl_handover.report.files import require_picture, save_figure, write_json
+from marl_handover.report.figure_style import require_picture, save_figure, write_json
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.pdf", "a.SVG", "new/folder/a.png"])

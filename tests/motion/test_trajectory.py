@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marl_handover.errors import InvalidSetting
-from marl_handover.motion.splines import basis, evaluate, knots
+from marl_handover.motion.trajectory import basis, evaluate, knots
 
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 8)).map(lambda pair: (pair[0] + pair[1], pair[0]))
 
