@@ -118,7 +118,7 @@ def dense(corners: np.ndarray) -> np.ndarray:
 def against_toppra(planner: MotionPlanner, paths: Sequence[np.ndarray]) -> dict[str, Any]:
     """Timing of found paths, control points (N, 5), beside toppra's with 100 and 500 grid intervals."""
     motion, arm = planner.motion, planner.model.arm
-    velocity = motion.velocity_share * np.array([arm.description.joint(name).velocity for name in ARM_JOINTS])
+    velocity = motion.velocity_scale * np.array([arm.description.joint(name).velocity for name in ARM_JOINTS])
     acceleration = np.full(len(ARM_JOINTS), math.radians(motion.acceleration_deg_s2))
     limits = (velocity, acceleration)
     time_path(paths[0], motion.degree, *limits, motion.sample_s)

@@ -85,6 +85,7 @@ def _guarded(name: str, arguments: list[str]) -> int:
     speaker, debug = f"{PROGRAM} {name}", False
     try:
         debug, arguments = _take_debug(arguments)
+        arguments = _take_plugins(arguments)
         status = _dispatch(name, arguments)
         sys.stdout.flush()  # here, so that a closed pipe shows itself inside this try
         return status
@@ -128,7 +129,8 @@ def _dispatch(name: str, arguments: list[str]) -> int:
 
     with working("loading the libraries", logged=False):
         module: Any = importlib.import_module(command.module)
-    from marl_handover.compose import compose, keys_help
+    from marl_handover.compose import compose
+    from marl_handover.compose_help import keys_help
 
     if any(argument in ("--help", "-h") for argument in arguments):
         print(f"usage: {PROGRAM} {name} [key=value ...]\n\n{command.summary}\n\n{keys_help(module.SCHEMA, module.ALIASES, module.GROUPS)}")
@@ -155,6 +157,17 @@ def _take_debug(arguments: list[str]) -> tuple[bool, list[str]]:
     return debug, rest
 
 
+def _take_plugins(arguments: list[str]) -> list[str]:
+    """``plugins=FILE.py`` is a key of every command too: these files are loaded before any other key is read."""
+    paths = [argument.partition("=")[2] for argument in arguments if argument.startswith("plugins=")]
+    if paths:
+        from marl_handover.plugins import add_plugins
+
+        for path in paths:
+            add_plugins(path)
+    return [argument for argument in arguments if not argument.startswith("plugins=")]
+
+
 def _overview() -> str:
     width = max(map(len, COMMANDS))
     lines = [f"  {name.ljust(width)}  {command.summary}" for name, command in COMMANDS.items()]
@@ -165,6 +178,7 @@ def _overview() -> str:
             *lines,
             "",
             f"{PROGRAM} COMMAND --help shows a command's keys and defaults; debug=true shows the traceback of an error.",
+            "plugins=FILE.py adds algorithms, policies, backends and layouts of your own, which that file registers.",
         ]
     )
 

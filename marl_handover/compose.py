@@ -14,27 +14,52 @@ Nothing global is touched: no run directory, no logging, no registered config.
 
 from __future__ import annotations
 
+import difflib
 import enum
+import functools
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+import types
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from marl_handover.bounds import check_bounds, expand_paths
-from marl_handover.compose_help import keys_help
-from marl_handover.compose_schema import Groups, Keys, SchemaTree, fitted, option_file, without_none
-from marl_handover.errors import BadOverride, CorruptFile, HandoverError, UnknownChoice
+from marl_handover.errors import BadOverride, CorruptFile, HandoverError, MissingFile, RenamedKey, UnknownChoice, UnknownKey
+from marl_handover.files import expanded
 from marl_handover.parsing import DEPTH, nesting, parse_yaml, read_yaml
 from marl_handover.resources import resource_path
 
-__all__ = ["compose", "from_text", "from_yaml", "keys_help", "to_yaml"]
+Groups = Mapping[str, Mapping[str, type]]
+"""Dotted key -> option name -> dataclass."""
+
+Keys = tuple[str, ...]
+"""A dotted key, split."""
+
+RENAMED = {
+    "decay_from": "lr_decay_start",
+    "steps_per_update": "env_steps_per_gradient_step",
+    "modes": "mixture_components",
+    "greedy_share": "deterministic_env_fraction",
+    "velocity_share": "velocity_scale",
+    "starts": "num_initial_guesses",
+    "edge_mm": "reach_slack_mm",
+    "glance_s": "poll_period_s",
+    "patience_s": "timeout_s",
+    "missed_mm": "lost_threshold_mm",
+    "cards": "hand_markers",
+    "fresh": "overwrite",
+}
+"""Keys of 0.1 and what they are called now, each without its section. Who types one is told; what was stored with one is read."""
+
+RENAMED_OPTIONS = {("algorithm", "box_sac"): "flat_sac"}
+"""The same of options that are chosen by name."""
 
 LONGEST_ARGUMENT = 5000
 """Characters of a ``key=value``: Hydra's parser takes its time over long ones, and text is at most 4096."""
@@ -82,17 +107,24 @@ def from_yaml(schema: type, path: Path | str, groups: Groups | None = None) -> A
     return _fitted_tree(schema, read_yaml(path, "configuration"), path, groups)
 
 
-def from_text(schema: type, text: str, origin: Path, groups: Groups | None = None) -> Any:
-    """As :func:`from_yaml`, of YAML text that was stored in the file ``origin``."""
+def from_text(schema: type, text: str, origin: Path, groups: Groups | None = None, stored: bool = True) -> Any:
+    """As :func:`from_yaml`, of YAML text from the file ``origin``; if it was ``stored`` by a program, its keys may have older names."""
     try:
         tree = parse_yaml(text)
     except ValueError as error:
         raise CorruptFile("configuration in", origin, str(error)) from error
-    return _fitted_tree(schema, tree, origin, groups)
+    return _fitted_tree(schema, tree, origin, groups, stored)
 
 
-def _fitted_tree(schema: type, tree: Mapping[Any, Any], path: Path, groups: Groups | None) -> Any:
-    composer = _Composer(schema, groups or {}, {}, path.parent)
+def present_names(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Stored settings, by dotted key, with the names that keys and options have now."""
+    named = {".".join(RENAMED.get(part, part) for part in key.split(".")): value for key, value in settings.items()}
+    options = {(f"{group}.name", old): new for (group, old), new in RENAMED_OPTIONS.items()}
+    return {key: options.get((key, value), value) if isinstance(value, str) else value for key, value in named.items()}
+
+
+def _fitted_tree(schema: type, tree: Mapping[Any, Any], path: Path, groups: Groups | None, stored: bool = False) -> Any:
+    composer = _Composer(schema, groups or {}, {}, path.parent, stored)
     try:
         composer.assign_tree((), tree, path)
         return composer.finish()
@@ -127,14 +159,10 @@ class _Choice:
 class _Composer:
     """Holds the growing configuration of one call."""
 
-    def __init__(self, schema: type, groups: Groups, aliases: Mapping[str, str], configs: Path) -> None:
-        for group, options in groups.items():
-            for name, option in options.items():
-                if getattr(option, "name", None) != name:
-                    raise TypeError(f"option {group}={name}: {option.__name__} needs the field: name: str = {name!r}")
+    def __init__(self, schema: type, groups: Groups, aliases: Mapping[str, str], configs: Path, stored: bool = False) -> None:
         self.tree = SchemaTree(schema, aliases)
         self.groups = {tuple(group.split(".")): options for group, options in groups.items()}
-        self.aliases, self.configs = aliases, configs
+        self.aliases, self.configs, self.stored = aliases, configs, stored
         self.references: list[tuple[Keys, str, Path | None]] = []
         """What was set by a reference such as ``${seed}``: only when all is set is its value known, and its kind checked."""
 
@@ -205,12 +233,23 @@ class _Composer:
 
     def assign_tree(self, keys: Keys, tree: Mapping[Any, Any], file: Path | None) -> None:
         """Merge a nested mapping below ``keys``."""
+        if self.stored:
+            tree = self._present(keys, tree)
         name = tree.get("name")
         if keys in self.groups and isinstance(name, str):
             self._choose(keys, _Choice(name, file))
         for key, value in tree.items():
             path = (*keys, str(key))
             self._assign(path, value, f"{'.'.join(path)}={value}", file)
+
+    def _present(self, keys: Keys, tree: Mapping[Any, Any]) -> dict[Any, Any]:
+        """A stored mapping with the names that keys and options have now."""
+        section = ".".join(keys)
+        if keys in self.groups and (section, tree.get("name")) in RENAMED_OPTIONS:
+            tree = {**tree, "name": RENAMED_OPTIONS[section, tree["name"]]}
+            self._choose(keys, _Choice(tree["name"]))
+        names = self.tree.names(keys)
+        return {RENAMED[key] if key not in names and RENAMED.get(key) in names else key: value for key, value in tree.items()}
 
     def _is_section(self, keys: Keys) -> bool:
         return keys in self.groups or (self.tree.has(keys) and is_dataclass(without_none(self.tree.kind(keys))))
@@ -242,9 +281,14 @@ class _Composer:
         """Put a chosen option in place: a dataclass from code, or a YAML file over what is there."""
         dotted = ".".join(keys)
         if keys in self.groups:
+            if (dotted, choice.name) in RENAMED_OPTIONS:
+                raise RenamedKey(f"{dotted}={choice.name}", f"{dotted}={RENAMED_OPTIONS[dotted, choice.name]}")
             if choice.name not in self.groups[keys]:
                 raise UnknownChoice(dotted, choice.name, self.groups[keys])
-            OmegaConf.update(self.tree.config, dotted, OmegaConf.structured(self.groups[keys][choice.name]), merge=False)
+            option = self.groups[keys][choice.name]
+            if getattr(option, "name", None) != choice.name:
+                raise TypeError(f"option {dotted}={choice.name}: {option.__name__} needs the field: name: str = {choice.name!r}")
+            OmegaConf.update(self.tree.config, dotted, OmegaConf.structured(option), merge=False)
             return
         if not self._is_section(keys):
             raise BadOverride(f"{dotted}={choice.name}", f"{dotted} is a single value, not a section with options")
@@ -322,3 +366,154 @@ def _plain(value: Any) -> Any:
     if isinstance(value, str):
         return re.sub(r"(\\*)\$\{", lambda match: match[1] * 2 + "\\${", value)
     return value
+
+
+class SchemaTree:
+    """A configuration being built, and the questions one can ask about its keys."""
+
+    def __init__(self, schema: type, aliases: Mapping[str, str]) -> None:
+        self.config: DictConfig = OmegaConf.structured(schema)
+        self._schema, self._aliases = schema, aliases
+
+    def kind(self, keys: Keys, where: str = "") -> Any:
+        """Type annotation of a key. Raises :class:`UnknownKey` (with ``where`` after the key) or :class:`BadOverride`."""
+        kind: Any = self._schema
+        for depth, name in enumerate(keys):
+            kind = self._step(keys[:depth], kind, name, where)
+        return kind
+
+    def has(self, keys: Keys) -> bool:
+        """Whether the key exists."""
+        try:
+            self.kind(keys)
+        except HandoverError:
+            return False
+        return True
+
+    def names(self, keys: Keys) -> tuple[str, ...]:
+        """The keys below a section; empty if it is none."""
+        section = self._section(keys, self.kind(keys))
+        return tuple(field.name for field in fields(section)) if is_dataclass(section) else ()
+
+    def merge(self, keys: Keys, value: Any) -> None:
+        """Merge one value in; OmegaConf's own errors pass through. An optional section that is None starts from its defaults."""
+        for depth in range(1, len(keys)):
+            above, section = ".".join(keys[:depth]), without_none(self.kind(keys[:depth]))
+            if is_dataclass(section) and OmegaConf.select(self.config, above) is None:
+                OmegaConf.update(self.config, above, OmegaConf.structured(section), merge=False)
+        OmegaConf.update(self.config, ".".join(keys), value, merge=True)
+
+    def _section(self, keys: Keys, kind: Any) -> Any:
+        """The type that is in place now, which may be a subclass of the annotated one."""
+        node = OmegaConf.select(self.config, ".".join(keys)) if keys else self.config
+        live = OmegaConf.get_type(node) if isinstance(node, DictConfig) else None
+        return live if is_dataclass(live) else without_none(kind)
+
+    def _step(self, keys: Keys, kind: Any, name: str, where: str) -> Any:
+        section = self._section(keys, kind)
+        if isinstance(section, type) and is_dataclass(section):
+            hints = _hints(section)
+            names = [field.name for field in fields(section)]
+            if name not in names:
+                if RENAMED.get(name) in names:
+                    raise RenamedKey(".".join((*keys, name)) + where, ".".join((*keys, RENAMED[name])))
+                if (elsewhere := self._deeper(RENAMED.get(name, ""))) and not keys:
+                    raise RenamedKey(name + where, elsewhere[0])
+                extra = [*self._aliases, "preset"] if names and not keys else []
+                raise UnknownKey(".".join((*keys, name)) + where, closest_first(name, [*names, *extra], self._deeper(name)) or ["(none)"])
+            return hints[name]
+        origin = get_origin(section) or section
+        if origin is dict or origin is Mapping:
+            return (*get_args(section), Any, Any)[1]
+        if section is Any:
+            return Any
+        dotted = ".".join(keys)
+        reason = f"{dotted} is set as a whole: {dotted}=[…]" if origin in (list, tuple) else f"{dotted} is a single value"
+        raise BadOverride(".".join((*keys, name)) + where, reason)
+
+    def _deeper(self, name: str) -> list[str]:
+        """Dotted keys that end in ``name``: most unknown keys only lack their section."""
+        found: list[str] = []
+
+        def walk(node: DictConfig, prefix: str) -> None:
+            for key in node:
+                if prefix and key == name:
+                    found.append(f"{prefix}{name}")
+                if not OmegaConf.is_missing(node, key) and isinstance(node._get_node(key), DictConfig) and node[key] is not None:
+                    walk(node[key], f"{prefix}{key!s}.")
+
+        walk(self.config, "")
+        return found
+
+
+@functools.cache
+def _hints(section: type) -> dict[str, Any]:
+    return get_type_hints(section)
+
+
+def without_none(kind: Any) -> Any:
+    """``X`` of ``X | None``; any other annotation as it is."""
+    if get_origin(kind) in (Union, types.UnionType):
+        rest = tuple(arg for arg in get_args(kind) if arg is not type(None))
+        return rest[0] if len(rest) == 1 else Union[rest]  # noqa: UP007  # the members are known only at run time
+    return kind
+
+
+def fitted(kind: Any, value: Any) -> Any:
+    """``value`` with whole numbers made what ``kind`` asks for (1 -> 1.0, 1e6 -> 1000000), inside lists and mappings too.
+
+    OmegaConf refuses these inside containers. Raises :class:`ValueError` for a number other than 0 and 1 where true or false is due,
+    which OmegaConf would take.
+    """
+    kind = without_none(kind)
+    origin, inner = get_origin(kind), get_args(kind)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if kind is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if kind is bool and isinstance(value, (int, float)) and value not in (0, 1):
+        raise ValueError(f"{value} is neither true nor false")
+    if origin is list and isinstance(value, list):
+        return [fitted(inner[0], item) for item in value]
+    if origin is dict and isinstance(value, Mapping):
+        return {key: fitted(inner[1], item) for key, item in value.items()}
+    return value
+
+
+def closest_first(name: str, choices: Iterable[str], before: Iterable[str] = ()) -> list[str]:
+    """``before``, then ``choices`` with those that resemble ``name`` in front."""
+    choices = list(dict.fromkeys(choices))
+    close = difflib.get_close_matches(name, choices, n=3)
+    return list(dict.fromkeys([*before, *close, *choices]))
+
+
+def option_names(folder: Path) -> tuple[str, ...]:
+    """Names of the YAML options in a folder, sorted."""
+    return tuple(sorted(path.stem for path in folder.glob("*.yaml")))
+
+
+def option_file(key: str, value: str, folder: Path, named_in: Path | None) -> Path:
+    """The YAML file that ``key=value`` means: a name in ``folder``, or a path.
+
+    A path is one with a slash or a YAML suffix; inside a file (``named_in``) it counts from that file's folder.
+    Raises :class:`MissingFile`, :class:`UnknownChoice`, or :class:`BadOverride` if ``key`` has no named options at all.
+    """
+    if "/" in value or value.endswith((".yaml", ".yml")):
+        path = expanded(value)
+        path = named_in.parent / path if named_in is not None else path
+        if not path.is_file():
+            raise MissingFile(f"{key} file", path, "check the path, or use a name" + _listing(folder))
+        return path
+    names = option_names(folder)
+    if value in names:
+        return folder / f"{value}.yaml"
+    if not names:
+        raise BadOverride(
+            f"{key}={value}", f"{key} is a section: set its keys one by one ({key}.key=value) or give a YAML file (./file.yaml)"
+        )
+    raise UnknownChoice(key, value, [*closest_first(value, names), "a path such as ./my.yaml"])
+
+
+def _listing(folder: Path) -> str:
+    names = option_names(folder)
+    return f": {', '.join(names)}" if names else ""

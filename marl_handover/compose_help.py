@@ -13,7 +13,7 @@ from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
-from marl_handover.compose_schema import Groups, option_names, without_none
+from marl_handover.compose import Groups, option_names, without_none
 from marl_handover.errors import MissingFile
 from marl_handover.resources import resource_path
 

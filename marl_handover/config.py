@@ -211,8 +211,8 @@ class MotionConfig:
     method: str = chosen("optimised", MOTION_METHODS)  # of loaded paths: optimised, or paper (its formulation, with SLSQP)
     control_points: int = bounded(11, 5, 25)  # of each path's spline
     degree: int = bounded(5, 3, 7)
-    starts: int = bounded(16, 1, 1000)  # first guesses tried at most
-    velocity_share: float = bounded(0.8, 0.01, 1.0)  # of the URDF's joint velocities
+    num_initial_guesses: int = bounded(16, 1, 1000)  # first guesses tried at most
+    velocity_scale: float = bounded(0.8, 0.01, 1.0)  # of the URDF's joint velocities
     acceleration_deg_s2: float = bounded(800.0, 1.0, 1e5)
     sample_s: float = bounded(0.02, 1e-3, 0.02)  # a timed trajectory is written at this interval
     finger_travel_mm: float = bounded(12.0, 0.1, 50.0)  # how far each finger opens before it closes on the pin
@@ -269,7 +269,7 @@ class LoopConfig:
 
     transfers: int = bounded(30, 1, 10_000)  # allowed an episode, picking up again after a miss included; not fewer than task.max_steps
     chart_inset: float = bounded(0.99, 0.1, 1.0)  # hand-overs keep to this part of the chart, or to the cell's own part if that is smaller
-    edge_mm: float = bounded(1.0, 0.0, 1.0)  # an object this far outside all reach counts as one at its edge
+    reach_slack_mm: float = bounded(1.0, 0.0, 1.0)  # an object this far outside all reach counts as one at its edge
 
     def validate(self, max_steps: int = 1) -> None:
         """Raise :class:`InvalidSetting` on a value out of its limits; ``max_steps``: transfers that the task allows up to its verdict."""

@@ -79,6 +79,14 @@ class UnknownKey(HandoverError):
         super().__init__(f"unknown key {shown(key, LONGEST_LIST)}; valid keys: {listed(self.choices)}")
 
 
+class RenamedKey(HandoverError):
+    """A key, or a name, that is called otherwise now."""
+
+    def __init__(self, old: str, new: str) -> None:
+        super().__init__(f"{shown(old, LONGEST_LIST)} is called {shown(new, LONGEST_LIST)} now")
+        self.old, self.new = old, new
+
+
 class BadOverride(HandoverError):
     """A ``key=value`` argument that cannot be read."""
 

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from marl_handover.errors import HandoverError
-from marl_handover.learning.export import run_arrays, save_policy
+from marl_handover.learning.checkpoint import run_arrays, save_policy
 
 
 def main() -> int:

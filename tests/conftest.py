@@ -14,6 +14,7 @@ from marl_handover.config import RewardConfig, TaskConfig
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Rules
 
+pytest_plugins = ["learning_fixtures"]
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
 torch.set_num_threads(1)

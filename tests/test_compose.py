@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from marl_handover.compose import compose, from_yaml, keys_help, to_yaml
+from marl_handover.compose import compose, from_yaml, to_yaml
+from marl_handover.compose_help import keys_help
 from marl_handover.config import CellConfig, TaskConfig
 from marl_handover.errors import BadOverride, CorruptFile, MissingFile, UnknownChoice, UnknownKey
 
@@ -286,7 +287,7 @@ def test_bad_files(make, tmp_path, configs):
 
 def test_an_option_must_carry_its_name():
     with pytest.raises(TypeError, match="name: str = 'ddpg'"):
-        compose(Toy, [], {"algorithm": {"ddpg": Sac}})
+        compose(Toy, ["algorithm=ddpg"], {"algorithm": {"ddpg": Sac}})
 
 
 def test_round_trip(make, tmp_path):

@@ -25,7 +25,7 @@ from marl_handover.viewer.trace_file import read_trace as read_log
 
 TRAIN = [
     *("train", "preset=smoke", "progress=false", "compile=off", "num_envs=16", "evaluation_interval=128", "checkpoint_interval=64"),
-    *("evaluation_episodes=10", "algorithm.learning_starts=64", "algorithm.steps_per_update=32", "algorithm.batch_size=32"),
+    *("evaluation_episodes=10", "algorithm.learning_starts=64", "algorithm.env_steps_per_gradient_step=32", "algorithm.batch_size=32"),
 ]
 FORKS = """
 import json, os, resource, sys
@@ -131,7 +131,7 @@ def test_a_training_killed_at_random_moments_goes_on_from_its_last_checkpoint(co
     trainer = resumed(tmp_path / "run")
     assert trainer.counters.step == found[-1]
     trainer._advance()
-    trainer.experience.close()
+    trainer.collector.close()
 
 
 def assert_named(status, said, folder):

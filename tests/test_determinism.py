@@ -8,15 +8,14 @@ import pytest
 import torch
 
 from marl_handover.compose import compose
-from marl_handover.learning.algorithm_settings import ALGORITHMS
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.learning.trainer import Trainer
 
 SHORT = ("compile=off", "progress=false", "num_envs=16", "steps=640", "evaluation_interval=320", "evaluation_episodes=50")
 OWN = {
-    "sac": ("actor_hidden=[32]", "critic_hidden=[32]", "learning_starts=160", "batch_size=32", "steps_per_update=32"),
-    "td3": ("hidden=[32]", "learning_starts=160", "batch_size=32", "steps_per_update=32"),
-    "box_sac": ("hidden=[32]", "learning_starts=160", "batch_size=32", "steps_per_update=32"),
+    "sac": ("actor_hidden=[32]", "critic_hidden=[32]", "learning_starts=160", "batch_size=32", "env_steps_per_gradient_step=32"),
+    "td3": ("hidden=[32]", "learning_starts=160", "batch_size=32", "env_steps_per_gradient_step=32"),
+    "flat_sac": ("hidden=[32]", "learning_starts=160", "batch_size=32", "env_steps_per_gradient_step=32"),
     "ppo": ("hidden=[32]", "rollout_steps=10", "batch_size=80"),
 }
 
@@ -33,7 +32,7 @@ def trained(folder, algorithm, seed):
 
 
 @pytest.mark.parametrize(
-    "algorithm", ["sac", "ppo", pytest.param("td3", marks=pytest.mark.slow), pytest.param("box_sac", marks=pytest.mark.slow)]
+    "algorithm", ["sac", "ppo", pytest.param("td3", marks=pytest.mark.slow), pytest.param("flat_sac", marks=pytest.mark.slow)]
 )
 def test_same_seed_same_run_other_seed_another(tmp_path, algorithm):
     rows, weights = trained(tmp_path / "one", algorithm, 1)

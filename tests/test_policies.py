@@ -15,20 +15,19 @@ from marl_handover import policies
 from marl_handover.compose import compose
 from marl_handover.config import TaskConfig
 from marl_handover.errors import CorruptFile, MissingFile, UnknownChoice
-from marl_handover.learning.algorithm_settings import ALGORITHMS
-from marl_handover.learning.export import policy_arrays, run_arrays, save_policy
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.checkpoint import policy_arrays, run_arrays, save_policy
+from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.learning.trainer import Trainer
-from marl_handover.learning.variants import Variant
+from marl_handover.learning.variant import Variant
 from marl_handover.task.episode import play
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Outcome, Rules
 
 KINDS = {
-    "sac": ("algorithm=sac", "algorithm.modes=1"),
-    "sac A": ("algorithm=sac", "algorithm.modes=3", "task.architecture=A"),
-    "sac unfolded": ("algorithm=sac", "algorithm.modes=2", "algorithm.canonical=false", "algorithm.harmonics=0"),
-    "box_sac": ("algorithm=box_sac",),
+    "sac": ("algorithm=sac", "algorithm.mixture_components=1"),
+    "sac A": ("algorithm=sac", "algorithm.mixture_components=3", "task.architecture=A"),
+    "sac unfolded": ("algorithm=sac", "algorithm.mixture_components=2", "algorithm.canonical=false", "algorithm.harmonics=0"),
+    "flat_sac": ("algorithm=flat_sac",),
     "td3 raw": ("algorithm=td3", "algorithm.layout=raw"),
     "ppo A": ("algorithm=ppo", "task.architecture=A"),
 }

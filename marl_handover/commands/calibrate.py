@@ -27,8 +27,8 @@ DOUBTFUL_MM = 1.5
 """Sightings of sound servos are less far off, with errors twice the usual ones as well."""
 
 _SUSPECTS = (
-    "does the camera hang as it was calibrated, is each hand's own marker where cards.place_mm says, is a horn loose, are the links the "
-    "cell's?"
+    "does the camera hang as it was calibrated, is each hand's own marker where hand_markers.place_mm says, is a horn loose, are the links "
+    "the cell's?"
 )
 _CUT_MM = 10.0
 WHAT = ("all", "camera", "servos", "grippers", "sheets")
@@ -63,12 +63,12 @@ def run(config: CalibrateCommand) -> int:
     if config.what == "sheets":
         config.board.validate()
         config.target.validate()
-        config.cards.validate(config.target)
+        config.hand_markers.validate(config.target)
         return _sheets(config, model)
     if config.what in ("all", "camera", "servos"):
         plugs = plug_in(config, model, config.motion, confirmed)
         try:
-            assistant: Assistant = plugs.twin or Person(config.cards)
+            assistant: Assistant = plugs.twin or Person(config.hand_markers)
             if config.what in ("all", "camera"):
                 _camera(config, plugs, assistant)
             if config.what in ("all", "servos"):
@@ -83,7 +83,7 @@ def run(config: CalibrateCommand) -> int:
 def _sheets(config: CalibrateCommand, model: CellModel) -> int:
     from marl_handover.perception.sheets import PX_PER_MM, marker_sheet, page, save_sheet, write_sheets
 
-    folder, cards, target = config.folder() / "sheets", config.cards, config.target
+    folder, cards, target = config.folder() / "sheets", config.hand_markers, config.target
     files = write_sheets(folder, model.cell.config.block, target, config.board, config.paper)
     sheets = [marker_sheet(target.dictionary, number, cards.marker_mm, cards.marker_mm + _CUT_MM, PX_PER_MM) for number in cards.ids]
     words = f"markers {cards.ids[0]} for the left hand, {cards.ids[1]} for the right: flat on top, upper edge to the left"
@@ -122,7 +122,7 @@ def _servos(config: CalibrateCommand, plugs: Plugs, assistant: Assistant, model:
     found: dict[str, Measured] = {}
     with driver:
         driver.arm()
-        procedure = ServoCalibration(driver, plugs.camera, seen_by, config.target, config.cards, config.seed, config.postures)
+        procedure = ServoCalibration(driver, plugs.camera, seen_by, config.target, config.hand_markers, config.seed, config.postures)
         for arm, name in enumerate(ARMS):
             found[name] = measured = procedure.arm(arm)
             print(
@@ -151,7 +151,7 @@ def _grippers(config: CalibrateCommand, model: CellModel) -> None:
     backend = HardwareBackend(model, config.motion, config=config, confirm=confirmed, grippers=False)
     found: dict[str, Grip] = {}
     try:
-        assistant: Assistant = backend.lab.twin or Person(config.cards)
+        assistant: Assistant = backend.lab.twin or Person(config.hand_markers)
         first = places(model.cell)[0]
         assistant.stand_block(first)
         backend.reset(np.array(first), config.seed)

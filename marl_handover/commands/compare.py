@@ -25,7 +25,7 @@ class CompareConfig:
     rows: list[str] = field(default_factory=list)  # some of its rows; []: all
     seeds: int = bounded(0, 0, 1000)  # of every row; 0: as the suite has it; an evaluation that the suite gives fewer keeps to those
     out: str = path_field()  # folder of runs and results, shared by all machines; runs/compare/<suite>, with -quick
-    fresh: list[str] = field(default_factory=list)  # rows, or row/evaluation, whose results are thrown away and made anew
+    overwrite: list[str] = field(default_factory=list)  # rows, or row/evaluation, whose results are thrown away and made anew
     report_only: bool = False  # run nothing: tables and figures of what is there
     launcher: str = chosen("loky", ("loky", "ray"))  # loky: the cores of this machine; ray: a cluster
     address: str = ""  # of the Ray cluster: auto, host:port or local
@@ -63,7 +63,7 @@ def run(config: CompareConfig) -> int:
         raise InvalidSetting("out", str(out), "a folder; this is a file")
     tasks = plan_tasks(suite, out, Grammar(train.ALIASES, train.GROUPS), Grammar(evaluate.ALIASES, evaluate.GROUPS))
     for task in tasks:
-        check_unchanged(task, config.fresh)
+        check_unchanged(task, config.overwrite)
     failures, others = ({}, []) if config.report_only else _run_tasks(config, tasks)
     results = _report(suite, whole, tasks, failures, out)
     _require_done(results, len(tasks), others, config.report_only)
@@ -76,11 +76,11 @@ def _check(config: CompareConfig, suite: Suite) -> None:
     for row in suite.rows:
         specs = [spec for seed in suite.seeds_of(row) for spec in suite.evaluations_of(row, seed)]
         known += dict.fromkeys(f"{row.name}/{spec.name}" for spec in specs)
-    for name in config.fresh:
+    for name in config.overwrite:
         if name not in known:
-            raise UnknownChoice("fresh", name, known)
-    if config.report_only and config.fresh:
-        raise InvalidSetting("fresh", config.fresh, "left out with report_only=true, which makes nothing anew")
+            raise UnknownChoice("overwrite", name, known)
+    if config.report_only and config.overwrite:
+        raise InvalidSetting("overwrite", config.overwrite, "left out with report_only=true, which makes nothing anew")
     if config.address and config.launcher == "loky":
         raise InvalidSetting("address", config.address, "left out with launcher=loky; it is that of a Ray cluster")
 
@@ -117,14 +117,14 @@ def _run_tasks(config: CompareConfig, tasks: Sequence[Task]) -> tuple[dict[str, 
     from marl_handover.compare.runs import clear_all, execute, finished, is_named
 
     # In the order of their seeds, so that what is there after half of the time compares all rows.
-    todo = sorted((task for task in tasks if not finished(task) or is_named(task, config.fresh)), key=lambda task: task.seed)
+    todo = sorted((task for task in tasks if not finished(task) or is_named(task, config.overwrite)), key=lambda task: task.seed)
     if len(todo) < len(tasks):
         print(f"{len(tasks) - len(todo)} of {len(tasks)} runs are done already", file=sys.stderr)
     _calibrate_twin(todo)
     failures, others = {}, []
     options: dict[str, Any] = {"launcher": config.launcher, "address": config.address, "jobs": config.jobs, "progress": config.progress}
     # Nothing is thrown away before there is somebody who can make it anew.
-    options["ready"] = lambda: clear_all(todo, config.fresh)
+    options["ready"] = lambda: clear_all(todo, config.overwrite)
     for task, result in fan_out(execute, todo, label=lambda task: task.name, **options):
         if isinstance(result, Failure):
             failures[task.name] = result.error

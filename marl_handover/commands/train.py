@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from marl_handover.errors import CheckpointMismatch, InvalidSetting, MissingFile
 from marl_handover.files import read_bounded
-from marl_handover.learning.algorithm_settings import ALGORITHMS
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.locks import claimed, new_folder
 from marl_handover.parsing import YAML_BYTES
 from marl_handover.progress import working
@@ -84,8 +83,7 @@ def resumed(folder: Path, asked: TrainConfig | None = None) -> Trainer:
     Raises:
         CheckpointMismatch: ``asked`` changes a setting; a run keeps the ones it was started with.
     """
-    from marl_handover.learning.checkpoint import FILE, load_checkpoint
-    from marl_handover.learning.export import train_config
+    from marl_handover.learning.checkpoint import FILE, load_checkpoint, train_config
     from marl_handover.learning.trainer import Trainer
 
     unsaved = not (folder / FILE).exists() and (folder / "config.yaml").exists()

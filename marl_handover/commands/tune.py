@@ -77,7 +77,7 @@ def _search(config: TuneConfig) -> tuple[Search, Path]:
     from marl_handover.compare.tune import Search
     from marl_handover.compare.tune_space import load_space
     from marl_handover.compare.tune_storage import located
-    from marl_handover.compose_schema import option_file
+    from marl_handover.compose import option_file
     from marl_handover.learning.trainer import usable_device
 
     check_bounds(config)

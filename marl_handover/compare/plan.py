@@ -12,8 +12,7 @@ from marl_handover.compare import records
 from marl_handover.compare.runs import RUN_FOLDER, Judgement, Task
 from marl_handover.compare.suite import EVALUATION_SEED_OFFSET, RowSpec, Suite
 from marl_handover.compare.suite_check import RUN
-from marl_handover.compose import compose
-from marl_handover.compose_schema import Groups
+from marl_handover.compose import Groups, compose
 from marl_handover.errors import HandoverError, InvalidSetting, UnknownChoice
 from marl_handover.files import expanded
 from marl_handover.learning.settings import TrainConfig

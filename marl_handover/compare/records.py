@@ -11,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from marl_handover.compose import present_names
 from marl_handover.errors import HandoverError
 from marl_handover.files import read_bounded, write_whole
 from marl_handover.learning.settings import TrainConfig
@@ -74,7 +75,7 @@ def differences(stored: Settings, config: TrainConfig | AssessmentConfig) -> Ite
     A setting that is younger than the record had its default. One that is gone from the schema says nothing, but one of a section that is
     left out now was taken back.
     """
-    usual, now = usual_settings(config), settings_of(config)
+    usual, now, stored = usual_settings(config), settings_of(config), present_names(stored)
     for key, value in now.items():
         before = stored.get(key, usual.get(key))
         if before != value:

@@ -50,7 +50,7 @@ def gather(suite: Suite, tasks: Sequence[Task], failures: Mapping[str, str], who
             try:
                 run = _run(task, suite)
             except HandoverError as error:
-                failed.setdefault(task.name, f"cannot be read: {error}; fresh=[{task.row}] makes it anew")
+                failed.setdefault(task.name, f"cannot be read: {error}; overwrite=[{task.row}] makes it anew")
                 run = {"seed": task.seed, "trained": None, "evaluations": {}}
             run["whole"] = not _unfinished(task, run)
             missing += [] if run["whole"] else [task.name]

@@ -75,10 +75,10 @@ class Task:
 class ChangedRow(HandoverError):
     """A row that was run, wholly or in part, with other settings."""
 
-    def __init__(self, folder: Path, what: str, key: str, stored: Any, asked: Any, fresh: str) -> None:
+    def __init__(self, folder: Path, what: str, key: str, stored: Any, asked: Any, overwrite: str) -> None:
         super().__init__(
             f"{what}: {folder} was made with {key} = {stored!r}, and now it is {asked!r}; "
-            f"fresh=[{fresh}] throws that away and starts anew, another out= keeps both"
+            f"overwrite=[{overwrite}] throws that away and starts anew, another out= keeps both"
         )
         self.folder, self.what, self.key, self.stored, self.asked = folder, what, key, stored, asked
 
@@ -91,26 +91,26 @@ class Busy(WorkFailed):
     """Another call is at work at a task whose results were to be thrown away."""
 
     def __init__(self, task: Task) -> None:
-        super().__init__(f"fresh: another call is at work at {task.name}; nothing was thrown away")
+        super().__init__(f"overwrite: another call is at work at {task.name}; nothing was thrown away")
         self.task = task
 
 
-def check_unchanged(task: Task, fresh: Sequence[str] = ()) -> None:
+def check_unchanged(task: Task, overwrite: Sequence[str] = ()) -> None:
     """Compare what was asked with what is in the task's folder.
 
     A setting that the stored run does not know, because it is younger, had its default.
 
     Raises:
-        ChangedRow: for a difference in a row, or in a row's evaluation, that is not named in ``fresh``.
+        ChangedRow: for a difference in a row, or in a row's evaluation, that is not named in ``overwrite``.
     """
-    if task.row in fresh:
+    if task.row in overwrite:
         return
     if task.train is not None:
         _compare_training(task, task.train)
     for judgement in task.judgements:
         name = f"{task.row}/{judgement.name}"
         path = task.folder / f"{judgement.name}.json"
-        report = None if name in fresh else read_record(path, records.REPORT_KEYS)
+        report = None if name in overwrite else read_record(path, records.REPORT_KEYS)
         if report is not None:
             about = report["provenance"]
             if about["policy"] != judgement.policy:
@@ -132,33 +132,33 @@ def _compare_training(task: Task, config: TrainConfig) -> None:
             raise ChangedRow(task.folder / TRAINED, f"row {task.row}", "config_hash", trained["config_hash"], now, task.row)
 
 
-def _compare(path: Path, stored: records.Settings, config: TrainConfig | AssessmentConfig, what: str, fresh: str) -> None:
+def _compare(path: Path, stored: records.Settings, config: TrainConfig | AssessmentConfig, what: str, overwrite: str) -> None:
     for key, before, now in records.differences(stored, config):
-        raise ChangedRow(path, what, key, before, now, fresh)
+        raise ChangedRow(path, what, key, before, now, overwrite)
 
 
-def is_named(task: Task, fresh: Sequence[str]) -> bool:
-    """Whether ``fresh`` names the task's row, or one of its evaluations."""
-    return task.row in fresh or any(f"{task.row}/{judgement.name}" in fresh for judgement in task.judgements)
+def is_named(task: Task, overwrite: Sequence[str]) -> bool:
+    """Whether ``overwrite`` names the task's row, or one of its evaluations."""
+    return task.row in overwrite or any(f"{task.row}/{judgement.name}" in overwrite for judgement in task.judgements)
 
 
-def clear_all(tasks: Sequence[Task], fresh: Sequence[str]) -> None:
-    """Throw away what ``fresh`` names of the tasks. Raises :class:`Busy`, before anything is, if another call is at one of them."""
-    named = [task for task in tasks if is_named(task, fresh)]
+def clear_all(tasks: Sequence[Task], overwrite: Sequence[str]) -> None:
+    """Throw away what ``overwrite`` names of the tasks. Raises :class:`Busy`, before anything is, if another call is at one of them."""
+    named = [task for task in tasks if is_named(task, overwrite)]
     with ExitStack() as locks:
         for task in named:
             if not locks.enter_context(held(task.folder)):
                 raise Busy(task)
         for task in named:
-            clear(task, fresh)
+            clear(task, overwrite)
 
 
-def clear(task: Task, fresh: Sequence[str]) -> None:
-    """Throw away what ``fresh`` names: a row with all it has, or one ``row/evaluation``."""
-    if task.row in fresh:
+def clear(task: Task, overwrite: Sequence[str]) -> None:
+    """Throw away what ``overwrite`` names: a row with all it has, or one ``row/evaluation``."""
+    if task.row in overwrite:
         shutil.rmtree(task.folder, ignore_errors=True)
     for judgement in task.judgements:
-        if f"{task.row}/{judgement.name}" in fresh:
+        if f"{task.row}/{judgement.name}" in overwrite:
             (task.folder / f"{judgement.name}.json").unlink(missing_ok=True)
             (task.folder / DONE).unlink(missing_ok=True)
 

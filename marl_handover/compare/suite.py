@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from marl_handover.compare.suite_check import MAX_SEEDS, RUN, check
-from marl_handover.compose_schema import option_file
+from marl_handover.compose import option_file
 from marl_handover.config import bounded, check_bounds, require_between, require_choice
 from marl_handover.errors import CorruptFile, HandoverError, InvalidSetting, UnknownChoice
 from marl_handover.parsing import read_yaml

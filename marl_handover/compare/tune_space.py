@@ -20,8 +20,7 @@ from optuna import Trial
 
 from marl_handover.compose import from_text, to_yaml
 from marl_handover.errors import CorruptFile, HandoverError, UnknownKey
-from marl_handover.learning.algorithm_settings import ALGORITHMS
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.parsing import parse_yaml, read_yaml
 
 KINDS = ("float", "int", "categorical")
@@ -147,7 +146,7 @@ def applied(config: TrainConfig, values: Mapping[str, Any], origin: Path) -> Tra
             if not isinstance(section, dict):
                 raise CorruptFile("search space", origin, f"{key}: {part} has no settings below it")
         section[name] = value
-    changed: TrainConfig = from_text(TrainConfig, yaml.safe_dump(tree), origin, {"algorithm": ALGORITHMS})
+    changed: TrainConfig = from_text(TrainConfig, yaml.safe_dump(tree), origin, {"algorithm": ALGORITHMS}, stored=False)
     return changed
 
 

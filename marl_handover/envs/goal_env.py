@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from marl_handover.cell import Cell, load_cell
-from marl_handover.compose_schema import closest_first
+from marl_handover.compose import closest_first
 from marl_handover.config import CellConfig, TaskConfig, require_choice
 from marl_handover.envs.problem_source import ProblemSource
 from marl_handover.envs.top_view import TopView

@@ -82,7 +82,7 @@ class SafetyFilterConfig:
     """What the safety filter between plan and wire lets through. Planned motions keep more clearance (``motion.*``) than this."""
 
     enabled: bool = True
-    speed_share: float = bounded(1.0, 0.01, 1.0)  # of the URDF's joint velocities; plans use motion.velocity_share of them
+    speed_share: float = bounded(1.0, 0.01, 1.0)  # of the URDF's joint velocities; plans use motion.velocity_scale of them
     step_deg: float = bounded(20.0, 0.1, 90.0)  # greatest change of a joint in one command
     table_clearance_mm: float = bounded(0.5, 0.0, 50.0)  # of every link after the turret
     arm_clearance_mm: float = bounded(3.0, 0.0, 100.0)

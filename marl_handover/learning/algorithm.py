@@ -10,26 +10,104 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from marl_handover.cell.chart import Chart
 from marl_handover.errors import InvalidSetting
-from marl_handover.learning.algorithm_settings import AlgorithmConfig
-from marl_handover.learning.exploration import UniformActions
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.settings import ALGORITHMS, AlgorithmConfig, OffPolicyConfig, TrainConfig
 from marl_handover.progress import working
 from marl_handover.task.rules import Rules
 
+KNOTS = 4097
+"""Of the table that turns chart coordinates that are uniform into ones whose places are."""
+
+
+class Places:
+    """Chart coordinates whose places are uniform on the table.
+
+    The chart is one-to-one, and its stretch at (alpha, beta) is the width of the shared space at alpha; so beta stays, and alpha goes
+    through the inverse of the width's cumulative sum.
+
+    Args:
+        chart: of the shared space.
+        device: of the coordinates.
+    """
+
+    def __init__(self, chart: Chart, device: torch.device | str = "cpu") -> None:
+        knots = torch.linspace(-1.0, 1.0, KNOTS, dtype=torch.float64)
+        width = chart.y_max_mm(knots * (chart.inset * chart.x_max_mm))
+        share = torch.cat([width.new_zeros(1), torch.cumulative_trapezoid(width, knots)])
+        self.knots = knots.float().to(device)
+        self.levels = (2 * share / share[-1] - 1).float().to(device)
+
+    def spread(self, place: Tensor) -> Tensor:
+        """Coordinates (..., 2), uniform on [-1, 1]^2, as ones that are uniform on the table; monotone, edges stay edges."""
+        level = place[..., 0].contiguous()
+        upper = torch.searchsorted(self.levels, level).clamp(1, KNOTS - 1)
+        low, high = self.levels[upper - 1], self.levels[upper]
+        part = ((level - low) / (high - low)).clamp(0.0, 1.0)
+        alpha = torch.lerp(self.knots[upper - 1], self.knots[upper], part)
+        return torch.stack([alpha, place[..., 1]], -1)
+
+
+class UniformActions:
+    """Draws uniform actions as ``algorithm.exploration`` says.
+
+    Args:
+        rules: for the size of an action and the chart.
+        config: settings of training.
+
+    Raises:
+        InvalidSetting: ``area`` for actions that are more than (final, arm, alpha, beta).
+    """
+
+    def __init__(self, rules: Rules, config: TrainConfig) -> None:
+        own = config.algorithm
+        self.size = rules.action_size
+        self.places = None
+        if isinstance(own, OffPolicyConfig) and own.exploration == "area":
+            if self.size != Rules.action_size:
+                raise InvalidSetting("algorithm.exploration", own.exploration, f"'chart' for variant={config.variant}")
+            self.places = Places(rules.cell.chart, config.device)
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Actions (count, size)."""
+        action = torch.rand(count, self.size, generator=generator, device=generator.device) * 2 - 1
+        return torch.cat([action[:, :2], self.spread(action[:, 2:])], -1) if self.places else action
+
+    def spread(self, place: Tensor) -> Tensor:
+        """Places (..., 2), uniform in the chart, as ``exploration`` wants them."""
+        return self.places.spread(place) if self.places else place
+
+
 logger = logging.getLogger(__name__)
+
+
+LEARNERS: dict[str, type[Algorithm]] = {}
+"""Learners of variant=hierarchical by the name of their algorithm; :data:`ALGORITHMS` imports the module that registers one."""
+
+Learner = TypeVar("Learner", bound="type[Algorithm]")
+
+
+def register_algorithm(settings: type[AlgorithmConfig]) -> Callable[[Learner], Learner]:
+    """A decorator for the learner of ``settings``, whose field ``name`` says what it is called."""
+
+    def add(learner: Learner) -> Learner:
+        ALGORITHMS.register(settings.name)(settings)
+        LEARNERS[settings.name] = learner
+        return learner
+
+    return add
 
 
 class Algorithm(ABC):
     """A learner of the supervisor's policy.
 
-    ``kind`` names the form of its exported actor (see :mod:`marl_handover.learning.export`); ``on_policy`` tells the trainer
+    ``kind`` names the form of its exported actor (see :mod:`marl_handover.learning.checkpoint`); ``on_policy`` tells the trainer
     how to feed it.
     """
 
@@ -43,7 +121,7 @@ class Algorithm(ABC):
         self.uniform = UniformActions(rules, config)
         self.progress = 0.0  # how much of the training is done
 
-    def blind(self, observation: Tensor) -> Tensor:
+    def random_action(self, observation: Tensor) -> Tensor:
         """Uniform actions (n, action_size), to start with."""
         return self.uniform.draw(len(observation), self.generator)
 
@@ -78,7 +156,7 @@ class Algorithm(ABC):
     def schedule(self, fraction: float) -> None:
         """Set what changes in the course of training; ``fraction`` of it is done. Here: the learning rate."""
         self.progress = fraction
-        start = self.config.decay_from
+        start = self.config.lr_decay_start
         left = 1.0 if fraction <= start or start >= 1.0 else max(0.0, (1.0 - fraction) / (1.0 - start))
         for part in self.modules().values():
             if isinstance(part, torch.optim.Optimizer):

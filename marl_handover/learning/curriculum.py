@@ -1,11 +1,36 @@
-"""Stages of epsilon."""
+"""Stages of epsilon: their settings, and which one training is in."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from marl_handover.envs.supervisor_env import SupervisorEnv
-from marl_handover.learning.settings import StageConfig
+from marl_handover.config import EPSILON_DEG, bounded
+
+if TYPE_CHECKING:
+    from marl_handover.envs.supervisor_env import SupervisorEnv
+
+
+@dataclass
+class StageConfig:
+    """One stage of the curriculum: each episode's epsilon is drawn log-uniformly from [low, high]."""
+
+    epsilon_low_deg: float = bounded(5.0, *EPSILON_DEG)
+    epsilon_high_deg: float = bounded(5.0, *EPSILON_DEG)
+    until_step: int = bounded(0, 0, 10**9)  # environment step that ends the stage; 0 = the end of training
+    until_success: float = bounded(1.0, 0.0, 1.0)  # a success rate in evaluation that ends it earlier; 1 = never
+
+
+def wide_first() -> list[StageConfig]:
+    """Ranges of epsilon that end lower and lower.
+
+    At a small epsilon a place that takes a transfer more than another is a sharp peak of the value, and a policy that is at it stays; at a
+    large one the peaks are wide and it moves to the best. A step from 3 to 0.7 degrees at once is too large: in one run of five the policy
+    forgets the larger epsilons as well, and has not learned them again by the end.
+    """
+    wide = [StageConfig(8.0, 15.0, until_step=8_000), StageConfig(3.0, 12.0, until_step=12_000)]
+    return [*wide, StageConfig(1.5, 12.0, until_step=16_000), StageConfig(0.7, 12.0)]
 
 
 class Curriculum:

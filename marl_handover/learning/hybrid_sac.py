@@ -1,4 +1,4 @@
-"""Hybrid SAC: soft actor-critic for a choice (arm, final, place mode) with a continuous place (alpha, beta) in some of its branches.
+"""Hybrid SAC: soft actor-critic for a choice (arm, final, mixture component) with a continuous place (alpha, beta) in some of its branches.
 
 The expectation over the branches is exact: V = sum_i p_i [Q_i - a_place log pi_i(place)] - a_branch sum_i p_i log p_i, where
 the final branches have no place. Two temperatures, one for each kind of choice. Besides the soft gradient, the actor's mean
@@ -17,10 +17,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
-from marl_handover.learning.algorithm import Algorithm, compiled, stepped
-from marl_handover.learning.algorithm_settings import SacConfig
+from marl_handover.learning.algorithm import Algorithm, compiled, register_algorithm, stepped
 from marl_handover.learning.networks import AfterstateCritic, HybridActor, arm_blocks, chosen_action, squashed_sample
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.settings import SacConfig, TrainConfig
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Command, Rules
 
@@ -32,10 +31,10 @@ class SoftValue(NamedTuple):
     """Soft value (n,) of a policy, with what it was made of."""
 
     value: Tensor
-    probability: Tensor  # (n, arms, 1 + modes)
+    probability: Tensor  # (n, arms, 1 + components)
     branch_entropy: Tensor  # (n,)
-    place_log_prob: Tensor  # (n, arms, modes)
-    mean: Tensor  # (n, arms, modes, 2), in (-1, 1)
+    place_log_prob: Tensor  # (n, arms, components)
+    mean: Tensor  # (n, arms, components, 2), in (-1, 1)
 
 
 class HybridSacLoss(LossModule):
@@ -115,19 +114,19 @@ class HybridSacLoss(LossModule):
         return loss, soft.branch_entropy.mean().detach(), place_entropy.detach()
 
     def _candidate_loss(self, batch: dict[str, Tensor], mean: Tensor, candidates: Tensor, offsets: Tensor) -> Tensor:
-        """Squared distance of each arm's best mode to the *nearest* of some places that beat it by the margin.
+        """Squared distance of each arm's best component to the *nearest* of some places that beat it by the margin.
 
         The nearest, not the best: between two equally good regions, drawing towards now one, now the other would leave the
-        mean in the bad middle. The places are ``candidates`` (n, arms, m, 2), and the ``mean`` (n, arms, modes, 2) moved by ``offsets``
-        (n, arms, k, 2).
+        mean in the bad middle. The places are ``candidates`` (n, arms, m, 2), and the ``mean`` (n, arms, components, 2) moved by
+        ``offsets`` (n, arms, k, 2).
         """
-        modes = mean.shape[2]
+        components = mean.shape[2]
         with torch.no_grad():
-            mode_value, mode = self._place_value(batch, mean).max(-1)
-        chosen = mean.gather(2, mode[..., None, None].expand(-1, -1, 1, 2)) if modes > 1 else mean
+            component_value, component = self._place_value(batch, mean).max(-1)
+        chosen = mean.gather(2, component[..., None, None].expand(-1, -1, 1, 2)) if components > 1 else mean
         with torch.no_grad():
             places = torch.cat([candidates, (chosen + offsets).clamp(-1.0, 1.0)], 2)
-            gain = self._place_value(batch, places) - mode_value[..., None] - self.config.candidate_margin
+            gain = self._place_value(batch, places) - component_value[..., None] - self.config.candidate_margin
         distance = (chosen - places).square().sum(-1)
         nearest = torch.where(gain > 0, distance.detach(), torch.inf).argmin(-1, keepdim=True)
         weight = gain.gather(-1, nearest).clamp(0.0, 1.0)
@@ -146,7 +145,7 @@ class HybridSacLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """``loss_qvalue`` and ``loss_actor`` of a sampled batch, TorchRL style; training uses the parts above."""
         batch, following = unpacked(tensordict)
-        shape = (len(tensordict), self.rules.cell.num_arms, self.actor.modes, 2)
+        shape = (len(tensordict), self.rules.cell.num_arms, self.actor.components, 2)
         noise = torch.randn(2, *shape, device=tensordict.device)
         none = torch.zeros(0, shape[1], 0, 2, device=tensordict.device)
         critic = self.critic_loss(batch, following, noise[0])
@@ -182,6 +181,7 @@ def unpacked(batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor
     return present, following
 
 
+@register_algorithm(SacConfig)
 class HybridSac(Algorithm):
     """Networks, optimisers and temperatures around :class:`HybridSacLoss`."""
 
@@ -192,7 +192,7 @@ class HybridSac(Algorithm):
         super().__init__(rules, config, generator)
         own = self.config
         can_finish = not rules.external_finish
-        actor = HybridActor(rules.cell, own.actor_hidden, own.modes, can_finish, own.canonical, own.harmonics).to(self.device)
+        actor = HybridActor(rules.cell, own.actor_hidden, own.mixture_components, can_finish, own.canonical, own.harmonics).to(self.device)
         critic = AfterstateCritic(own.critic_hidden, own.final_hidden, own.canonical, own.harmonics).to(self.device)
         target = AfterstateCritic(own.critic_hidden, own.final_hidden, own.canonical, own.harmonics).to(self.device).requires_grad_(False)
         target.load_state_dict(critic.state_dict())
@@ -230,7 +230,7 @@ class HybridSac(Algorithm):
 
     def about(self) -> dict[str, Any]:
         """How the actor reads its blocks."""
-        return {key: getattr(self.config, key) for key in ("modes", "canonical", "harmonics")}
+        return {"modes": self.config.mixture_components, "canonical": self.config.canonical, "harmonics": self.config.harmonics}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`; a checkpoint from before there was an average starts one from the actor it has."""
@@ -254,14 +254,14 @@ class HybridSac(Algorithm):
         """A branch and a place drawn from the policy."""
         branches = self.loss.actor(observation)
         # Some cells follow the deterministic policy: where that goes in circles, its states must get into the memory.
-        curious = torch.arange(len(observation), device=self.device) >= int(self.config.greedy_share * len(observation))
-        place, _ = squashed_sample(branches, self._noise(branches.mean.shape) * curious[:, None, None, None])
+        exploring = torch.arange(len(observation), device=self.device) >= int(self.config.deterministic_env_fraction * len(observation))
+        place, _ = squashed_sample(branches, self._noise(branches.mean.shape) * exploring[:, None, None, None])
         uniform = torch.rand(branches.logits.flatten(1).shape, generator=self.generator, device=self.device)
         gumbel = -(-uniform.clamp_min(1e-20).log()).log()
-        blind = torch.rand(place.shape[:-1], generator=self.generator, device=self.device) < self.config.random_place
-        blind &= curious[:, None, None]
-        place = torch.where(blind[..., None], self.uniform.spread(self._anywhere(place.shape)), place)
-        return chosen_action(branches.logits, place, gumbel * curious[:, None])
+        anywhere = torch.rand(place.shape[:-1], generator=self.generator, device=self.device) < self.config.random_place
+        anywhere &= exploring[:, None, None]
+        place = torch.where(anywhere[..., None], self.uniform.spread(self._anywhere(place.shape)), place)
+        return chosen_action(branches.logits, place, gumbel * exploring[:, None])
 
     @torch.no_grad()
     def act(self, observation: Tensor) -> Tensor:
@@ -272,7 +272,7 @@ class HybridSac(Algorithm):
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """One step of the critics, the actor, the temperatures and the target."""
         present, following = unpacked(batch)
-        shape = (len(batch), self.rules.cell.num_arms, self.config.modes, 2)
+        shape = (len(batch), self.rules.cell.num_arms, self.config.mixture_components, 2)
         critic_loss = self._critic_loss(present, following, self._noise(shape))
         stepped(self.critic_optimizer, critic_loss)
         tried = (int(shape[0] * self.config.candidate_share), shape[1], self.config.candidates, 2)

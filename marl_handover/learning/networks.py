@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torchrl.data import Bounded
 
 from marl_handover.cell import Cell
 from marl_handover.task.observations import ARM_FIELDS, ODD_FIELDS
@@ -50,7 +51,7 @@ class TwinMLP(nn.Module):
         return x[..., 0]
 
 
-class Mirror(nn.Module):
+class Canonicalize(nn.Module):
     """Folds the symmetry M_x: turns each arm's block so that the sine of its hand-over angle is never negative.
 
     Where the hand-over has no bearing (that sine is 0), the sine of the finishing error decides.
@@ -76,7 +77,7 @@ class Mirror(nn.Module):
 ANGLES = (("cos_finish_error", "sin_finish_error"), ("cos_hand_over", "sin_hand_over"))
 
 
-class Harmonics(nn.Module):
+class AngleFeatures(nn.Module):
     """Appends the cosines and sines of 2, 4, ... 2^count times each angle of a block, for sharper functions of it."""
 
     def __init__(self, count: int) -> None:
@@ -96,12 +97,12 @@ class Harmonics(nn.Module):
         return torch.cat(parts, -1)
 
 
-class Branches(NamedTuple):
-    """What the actor says of every branch. Branch 0 of an arm is final, the others are its place modes.
+class ActionDistribution(NamedTuple):
+    """What the actor says of every branch. Branch 0 of an arm is final, the others are its mixture components.
 
     Attributes:
-        logits: (n, num_arms, 1 + modes).
-        mean: (n, num_arms, modes, 2), of (alpha, beta) before the tanh, in table coordinates.
+        logits: (n, num_arms, 1 + components).
+        mean: (n, num_arms, components, 2), of (alpha, beta) before the tanh, in table coordinates.
         log_std: like ``mean``.
     """
 
@@ -110,8 +111,8 @@ class Branches(NamedTuple):
     log_std: Tensor
 
 
-def squashed_sample(branches: Branches, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Reparametrised places (n, arms, modes, 2) in (-1, 1) and their log-densities (n, arms, modes)."""
+def squashed_sample(branches: ActionDistribution, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Reparametrised places (n, arms, components, 2) in (-1, 1) and their log-densities (n, arms, components)."""
     raw = branches.mean + branches.log_std.exp() * noise
     log_prob = -0.5 * noise.square() - branches.log_std - 0.5 * math.log(2 * math.pi)
     # log(1 - tanh(x)^2), stable at saturation
@@ -122,7 +123,7 @@ def squashed_sample(branches: Branches, noise: Tensor) -> tuple[Tensor, Tensor]:
 def chosen_action(logits: Tensor, place: Tensor, noise: Tensor | None = None) -> Tensor:
     """Actions (n, 4) of the branch with the largest logit, after adding ``noise`` to the flattened logits.
 
-    ``logits`` (n, arms, 1 + modes); ``place`` (n, arms, modes, 2).
+    ``logits`` (n, arms, 1 + components); ``place`` (n, arms, components, 2).
     """
     flat = logits.flatten(1) if noise is None else logits.flatten(1) + noise
     branch = flat.argmax(-1)
@@ -144,37 +145,37 @@ class HybridActor(nn.Module):
     Args:
         cell: the cell, for the arms' mirror signs.
         hidden: widths.
-        modes: place modes an arm.
+        components: mixture components an arm.
         can_finish: whether there is a final branch (architecture B); without one its logit is minus infinity.
         canonical: fold the symmetry M_x.
-        harmonics: see :class:`Harmonics`.
+        harmonics: see :class:`AngleFeatures`.
     """
 
     beta_sign: Tensor
 
-    def __init__(self, cell: Cell, hidden: Sequence[int], modes: int, can_finish: bool, canonical: bool, harmonics: int) -> None:
+    def __init__(self, cell: Cell, hidden: Sequence[int], components: int, can_finish: bool, canonical: bool, harmonics: int) -> None:
         super().__init__()
-        self.modes, self.can_finish = modes, can_finish
-        self.mirror, self.harmonics = Mirror(canonical), Harmonics(harmonics)
-        self.net = mlp(self.harmonics.width, hidden, 1 + 5 * modes)
+        self.components, self.can_finish = components, can_finish
+        self.canonicalize, self.features = Canonicalize(canonical), AngleFeatures(harmonics)
+        self.net = mlp(self.features.width, hidden, 1 + 5 * components)
         last = self.net[-1]
-        if modes > 1 and isinstance(last, nn.Linear):  # start the modes apart, so that they do not learn the same thing
+        if components > 1 and isinstance(last, nn.Linear):  # start the components apart, so that they do not learn the same thing
             with torch.no_grad():
-                last.bias[1 + modes : 1 + 3 * modes : 2] = torch.linspace(-0.8, 0.8, modes)
+                last.bias[1 + components : 1 + 3 * components : 2] = torch.linspace(-0.8, 0.8, components)
         self.register_buffer("beta_sign", torch.tensor([float(arm.mirror) for arm in cell.arms]), persistent=False)
 
-    def forward(self, observation: Tensor) -> Branches:
-        """Branches of observations (n, size) of the ``relative`` layout."""
-        blocks, sign = self.mirror(arm_blocks(observation).unsqueeze(-2))
-        out = self.net(self.harmonics(blocks.squeeze(-2)))
-        modes = self.modes
-        logits = out[..., : 1 + modes]
+    def forward(self, observation: Tensor) -> ActionDistribution:
+        """ActionDistribution of observations (n, size) of the ``relative`` layout."""
+        blocks, sign = self.canonicalize(arm_blocks(observation).unsqueeze(-2))
+        out = self.net(self.features(blocks.squeeze(-2)))
+        components = self.components
+        logits = out[..., : 1 + components]
         if not self.can_finish:
             logits = torch.cat([torch.full_like(logits[..., :1], -1e9), logits[..., 1:]], -1)
-        mean = out[..., 1 + modes : 1 + 3 * modes].unflatten(-1, (modes, 2))
-        log_std = out[..., 1 + 3 * modes :].unflatten(-1, (modes, 2)).clamp(*LOG_STD_RANGE)
+        mean = out[..., 1 + components : 1 + 3 * components].unflatten(-1, (components, 2))
+        log_std = out[..., 1 + 3 * components :].unflatten(-1, (components, 2)).clamp(*LOG_STD_RANGE)
         signs = torch.stack([sign.expand(mean.shape[:-1]), self.beta_sign[:, None].expand(mean.shape[:-1])], -1)
-        return Branches(logits, mean * signs, log_std)
+        return ActionDistribution(logits, mean * signs, log_std)
 
 
 class AfterstateCritic(nn.Module):
@@ -186,16 +187,21 @@ class AfterstateCritic(nn.Module):
 
     def __init__(self, place_hidden: Sequence[int], final_hidden: Sequence[int], canonical: bool, harmonics: int) -> None:
         super().__init__()
-        self.mirror, self.harmonics = Mirror(canonical), Harmonics(harmonics)
-        self.place = TwinMLP(2 * self.harmonics.width, place_hidden)
-        self.final = TwinMLP(self.harmonics.width, final_hidden)
+        self.canonicalize, self.features = Canonicalize(canonical), AngleFeatures(harmonics)
+        self.place = TwinMLP(2 * self.features.width, place_hidden)
+        self.final = TwinMLP(self.features.width, final_hidden)
 
     def value_place(self, following: Tensor) -> Tensor:
         """Values (2, ...) of afterstates (..., 2, fields): the acting arm's block, then the other's."""
-        blocks, _ = self.mirror(following)
-        return self.place(self.harmonics(blocks).flatten(-2).flatten(0, -2)).unflatten(-1, following.shape[:-2])
+        blocks, _ = self.canonicalize(following)
+        return self.place(self.features(blocks).flatten(-2).flatten(0, -2)).unflatten(-1, following.shape[:-2])
 
     def value_final(self, block: Tensor) -> Tensor:
         """Values (2, ...) of finishing, from the acting arm's blocks (..., fields)."""
-        blocks, _ = self.mirror(block.unsqueeze(-2))
-        return self.final(self.harmonics(blocks.squeeze(-2)).flatten(0, -2)).unflatten(-1, block.shape[:-1])
+        blocks, _ = self.canonicalize(block.unsqueeze(-2))
+        return self.final(self.features(blocks.squeeze(-2)).flatten(0, -2)).unflatten(-1, block.shape[:-1])
+
+
+def action_spec(actions: int, device: torch.device) -> Bounded:
+    """The action space of one cell."""
+    return Bounded(-1.0, 1.0, shape=(actions,), device=device)

@@ -130,7 +130,7 @@ class Board:
         self._records.write(Event(wall_time=time.time(), **content).SerializeToString())
 
 
-def require_sound(step: int, losses: Mapping[str, Tensor]) -> None:
+def check_finite(step: int, losses: Mapping[str, Tensor]) -> None:
     """Raise :class:`Diverged` if a loss is no number any more."""
     values = {name: float(loss) for name, loss in losses.items() if name.startswith("loss_")}
     bad = {name: value for name, value in values.items() if not math.isfinite(value)}

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from marl_handover.config import (
-    EPSILON_DEG,
+    EXPLORATIONS,
     HINDSIGHT,
+    LAYOUTS,
     CellConfig,
     CentralisedConfig,
     DecentralisedConfig,
@@ -25,7 +26,73 @@ from marl_handover.config import (
     sized,
 )
 from marl_handover.errors import InvalidSetting
-from marl_handover.learning.algorithm_settings import ALGORITHMS, AlgorithmConfig, OffPolicyConfig, SacConfig
+from marl_handover.learning.curriculum import StageConfig, wide_first
+from marl_handover.plugins import Registry
+
+
+@dataclass
+class AlgorithmConfig:
+    """What every algorithm has."""
+
+    name: str = ""
+    layout: str = chosen("relative", LAYOUTS)  # observation layout
+    previous_arm: bool = True  # whether observations say which arm moved last
+    learning_rate: float = bounded(1e-3, 1e-8, 10.0)
+    lr_decay_start: float = bounded(0.5, 0.0, 1.0)  # fraction of training after which the learning rate falls linearly to zero
+    gamma: float = bounded(0.95, 1e-3, 1.0)
+    reward_scale: float = bounded(0.5, 1e-6, 1e6)
+    batch_size: int = bounded(256, 1, 65_536)
+
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` on a value out of its limits."""
+        check_bounds(self, "algorithm.")
+        if self.layout == "object":
+            raise InvalidSetting("algorithm.layout", self.layout, "'raw' or 'relative'; 'object' hides the goal")
+
+
+@dataclass
+class OffPolicyConfig(AlgorithmConfig):
+    """What every algorithm with a replay memory has."""
+
+    learning_starts: int = bounded(1000, 0, 10**9)  # environment steps with uniform actions, before the first update
+    exploration: str = chosen("chart", EXPLORATIONS)  # what uniform places are uniform in: chart (alpha and beta), or area (of the table)
+    env_steps_per_gradient_step: float = bounded(8.0, 0.01, 1e6)  # environment steps for each gradient step
+    tau: float = bounded(0.01, 0.0, 1.0)  # target smoothing
+
+
+@dataclass
+class OnPolicyConfig(AlgorithmConfig):
+    """What every algorithm without a memory has: it learns from whole roll-outs."""
+
+    rollout_steps: int = bounded(32, 1, 4096)  # environment steps a cell between updates
+    epochs: int = bounded(4, 1, 1000)
+
+
+@dataclass
+class SacConfig(OffPolicyConfig):
+    """Hybrid SAC: exact expectation over (arm, final, mixture component), tanh-Gaussian places, two temperatures."""
+
+    name: str = "sac"
+    actor_hidden: list[int] = bounded([256, 256], 1, 4096, (0, 8))  # places are harder to say than to judge
+    critic_hidden: list[int] = bounded([128, 128], 1, 4096, (0, 8))
+    final_hidden: list[int] = bounded([64, 64], 1, 4096, (0, 8))  # of the critic of finishing
+    actor_tau: float = bounded(0.005, 0.0, 1.0)  # smoothing of the actor that is judged and kept; 1: none
+    mixture_components: int = bounded(1, 1, 64)  # place distributions an arm, chosen between like the other discrete branches
+    canonical: bool = True  # fold the mirror symmetry M_x into the networks
+    harmonics: int = bounded(2, 0, 16)  # doublings of the angles that the networks see
+    candidates: int = bounded(3, 0, 256)  # places an arm tried anywhere, and as many nearby; the actor is drawn to the nearest better one
+    candidate_share: float = bounded(0.5, 0.0, 1.0)  # of the batch
+    candidate_weight: float = bounded(1.0, 0.0, 1e6)
+    candidate_margin: float = bounded(0.25, -1e6, 1e6)  # in units of scaled reward
+    deterministic_env_fraction: float = bounded(0.25, 0.0, 1.0)  # of the cells, which act without noise
+    random_place: float = bounded(0.1, 0.0, 1.0)  # share of exploration's places that are drawn anywhere
+    place_entropy_start: float = bounded(-2.0, -100.0, 100.0)  # target entropies fall from start (linearly / geometrically) ...
+    place_entropy_end: float = bounded(-5.0, -100.0, 100.0)
+    branch_entropy_start: float = bounded(0.1, 1e-9, 10.0)
+    branch_entropy_end: float = bounded(0.01, 1e-9, 10.0)
+    entropy_until: float = bounded(0.75, 1e-6, 1000.0)  # ... to end at this fraction of training
+    temperature_rate: float = bounded(3e-3, 1e-9, 10.0)
+    initial_temperature: float = bounded(0.1, 1e-9, 1e3)
 
 
 @dataclass
@@ -52,17 +119,16 @@ class ReplayConfig:
     correct_terminated: bool = True  # False keeps the stored end flag when relabelling, as Stable-Baselines3 does
 
 
-@dataclass
-class StageConfig:
-    """One stage of the curriculum: each episode's epsilon is drawn log-uniformly from [low, high]."""
+ALGORITHMS: Registry[type[AlgorithmConfig]] = Registry(
+    "algorithm",
+    {
+        "sac": "marl_handover.learning.hybrid_sac",
+        **{name: f"marl_handover.baselines.{name}" for name in ("flat_sac", "td3", "ppo", "dqn")},
+    },
+)
+"""Settings of each algorithm by name; :func:`marl_handover.learning.algorithm.register_algorithm` adds one, with its learner."""
 
-    epsilon_low_deg: float = bounded(5.0, *EPSILON_DEG)
-    epsilon_high_deg: float = bounded(5.0, *EPSILON_DEG)
-    until_step: int = bounded(0, 0, 10**9)  # environment step that ends the stage; 0 = the end of training
-    until_success: float = bounded(1.0, 0.0, 1.0)  # a success rate in evaluation that ends it earlier; 1 = never
-
-
-VARIANTS: dict[str, Collection[str]] = {"hierarchical": ALGORITHMS, "centralised": ("sac", "box_sac"), "decentralised": ("sac",)}
+VARIANTS: dict[str, Collection[str]] = {"hierarchical": ALGORITHMS, "centralised": ("sac", "flat_sac"), "decentralised": ("sac",)}
 """Formulations, and the algorithms that each has learners for."""
 
 SOURCES = ("batched", "aec")
@@ -72,17 +138,6 @@ COLLECTORS = ("local", "multiprocess", "ray")
 
 MOST_BYTES, MOST_WEIGHTS, MOST_ACTIVATIONS = 500 * 10**6, 8 * 10**6, 64 * 10**6
 """Of a replay memory, of one network, and of one layer's output for one batch; a training takes several times each."""
-
-
-def wide_first() -> list[StageConfig]:
-    """Ranges of epsilon that end lower and lower.
-
-    At a small epsilon a place that takes a transfer more than another is a sharp peak of the value, and a policy that is at it stays; at a
-    large one the peaks are wide and it moves to the best. A step from 3 to 0.7 degrees at once is too large: in one run of five the policy
-    forgets the larger epsilons as well, and has not learned them again by the end.
-    """
-    wide = [StageConfig(8.0, 15.0, until_step=8_000), StageConfig(3.0, 12.0, until_step=12_000)]
-    return [*wide, StageConfig(1.5, 12.0, until_step=16_000), StageConfig(0.7, 12.0)]
 
 
 @dataclass
@@ -131,7 +186,7 @@ class TrainConfig:
             require_at_least(f"curriculum[{index}].epsilon_high_deg", stage.epsilon_high_deg, stage.epsilon_low_deg)
         self.algorithm.validate()
         if self.algorithm.name == "sac" and self.algorithm.layout != "relative":
-            raise InvalidSetting("algorithm.layout", self.algorithm.layout, "'relative' for algorithm=sac; box_sac takes any layout")
+            raise InvalidSetting("algorithm.layout", self.algorithm.layout, "'relative' for algorithm=sac; flat_sac takes any layout")
         self.centralised.validate()
         if self.variant == "centralised":
             self._validate_centralised()

@@ -20,13 +20,12 @@ from marl_handover.compose import to_yaml
 from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, WorkFailed, first_line
 from marl_handover.files import remove_temporaries, write_whole
 from marl_handover.learning.algorithm import OwnTorch, compile_state, subnormals_flushed
-from marl_handover.learning.algorithm_settings import OffPolicyConfig, PpoConfig
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
+from marl_handover.learning.collector import Collected
 from marl_handover.learning.curriculum import Curriculum
-from marl_handover.learning.experience import Collected
-from marl_handover.learning.recorder import Recorder, machine, require_sound
-from marl_handover.learning.settings import TrainConfig
-from marl_handover.learning.variants import make_variant
+from marl_handover.learning.recorder import Recorder, check_finite, machine
+from marl_handover.learning.settings import OffPolicyConfig, OnPolicyConfig, TrainConfig
+from marl_handover.learning.variant import make_variant
 from marl_handover.locks import claimed
 from marl_handover.parsing import parse_yaml
 from marl_handover.task.planner import ExactPlanner
@@ -92,7 +91,7 @@ class Trainer:
         self.curriculum = Curriculum(config.curriculum, self.env)
         self.counters = Counters(next_evaluation=config.evaluation_interval, next_checkpoint=config.checkpoint_interval)
         self.replay = self.variant.replay(self.env, config, self.generator)
-        self.experience = self.variant.experience(self.env, config)
+        self.collector = self.variant.collector(self.env, config)
         self.rollout: list[TensorDictBase] = []
         self.recent = torch.zeros(3)  # finished and solved episodes, and their transfers, since the last evaluation
         self.losses: dict[str, Tensor] = {}
@@ -123,14 +122,14 @@ class Trainer:
                 self._report(recorder)
         finally:
             recorder.close()
-            self.experience.close()
+            self.collector.close()
         self.save()
 
     def _advance(self) -> None:
         """Collect, and make the gradient steps that are due."""
         config = self.config.algorithm
-        blind = isinstance(config, OffPolicyConfig) and self.counters.step < config.learning_starts
-        collected = self.experience.collect(self.algorithm.blind if blind else self.algorithm.explore)
+        starting = isinstance(config, OffPolicyConfig) and self.counters.step < config.learning_starts
+        collected = self.collector.collect(self.algorithm.random_action if starting else self.algorithm.explore)
         self.counters.step += collected.steps
         self.recent += collected.ended
         self.counters.episodes += int(collected.ended[0])
@@ -138,7 +137,7 @@ class Trainer:
         with subnormals_flushed():
             if isinstance(config, OffPolicyConfig):
                 self._learn_from_replay(collected, config)
-            elif isinstance(config, PpoConfig):
+            elif isinstance(config, OnPolicyConfig):
                 assert collected.transition is not None
                 self._learn_from_rollout(collected.transition, config)
 
@@ -148,7 +147,7 @@ class Trainer:
     def _learn_from_replay(self, collected: Collected, config: OffPolicyConfig) -> None:
         if collected.rows is not None:
             self.replay.extend(collected.rows)
-        due = int((self.counters.step - config.learning_starts) / config.steps_per_update) - self.counters.gradient_step
+        due = int((self.counters.step - config.learning_starts) / config.env_steps_per_gradient_step) - self.counters.gradient_step
         if due <= 0 or len(self.replay) < config.batch_size:
             return
         # One draw for all updates that are due: a draw costs as much as an update.
@@ -157,7 +156,7 @@ class Trainer:
             self.losses = self.algorithm.update(batch)
         self.counters.gradient_step += due
 
-    def _learn_from_rollout(self, transition: TensorDictBase, config: PpoConfig) -> None:
+    def _learn_from_rollout(self, transition: TensorDictBase, config: OnPolicyConfig) -> None:
         kept = transition.select(
             "observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"), ("next", "terminated")
         )
@@ -171,7 +170,7 @@ class Trainer:
     def _report(self, recorder: Recorder) -> None:
         counters = self.counters
         if counters.step >= counters.next_evaluation or counters.step >= self.config.steps:
-            require_sound(counters.step, self.losses)
+            check_finite(counters.step, self.losses)
             counters.next_evaluation += self.config.evaluation_interval
             self.last = self.evaluate()
             self._keep_best()
@@ -269,7 +268,7 @@ class Trainer:
                 "counters": asdict(self.counters),
                 "algorithm": self.algorithm.state_dict(),
                 "replay": {"rows": rows, "cursor": self.replay._writer._cursor},
-                "experience": self.experience.state_dict(),
+                "experience": self.collector.state_dict(),
                 "rollout": [step.to_dict() for step in self.rollout],
                 "recent": self.recent,
                 "last": self.last,
@@ -303,7 +302,7 @@ class Trainer:
         self.algorithm.load_state_dict(state["algorithm"])
         if self.counters.step:
             self._schedule()
-        self.experience.load_state_dict(state["experience"])
+        self.collector.load_state_dict(state["experience"])
         if state["replay"]["rows"] is not None:
             rows = TensorDict.from_dict(state["replay"]["rows"], auto_batch_size=True, batch_dims=1)
             self.replay.extend(rows)

@@ -161,8 +161,9 @@ def settings_key(cell: Cell, motion: MotionConfig) -> str:
     The name of a cell and the part of its chart in use do not count, nor what concerns only the timing; and a table holds what the
     optimiser finds, whatever method plans.
     """
-    untimed = {"method", "velocity_share", "acceleration_deg_s2", "sample_s", "grasp_s", "release_s"}
-    settings = sorted((name, value) for name, value in asdict(motion).items() if name not in untimed)
+    untimed = {"method", "velocity_scale", "acceleration_deg_s2", "sample_s", "grasp_s", "release_s"}
+    older = {"num_initial_guesses": "starts"}  # keys of tables that are kept were made with this name
+    settings = sorted((older.get(name, name), value) for name, value in asdict(motion).items() if name not in untimed)
     cell.require_pair("a table of path lengths")
     # A pair says nothing of its arms one by one; keys from before cells could list their arms stay valid.
     shape = to_yaml(replace(cell.config, name="", urdf="", chart_inset=1.0)).replace("arms: []\n", "")
@@ -232,7 +233,7 @@ def _excess_mm(planner: Any, pick_mm: Floats, place_mm: Floats) -> float:
     motion = planner.motion
     segment, guesses = planner.carrying(0, pick_mm, place_mm, planner.home_rad)
     try:
-        found = find_path(segment, guesses, motion.control_points, motion.degree, motion.starts, thorough=True)
+        found = find_path(segment, guesses, motion.control_points, motion.degree, motion.num_initial_guesses, thorough=True)
     except NoPath:
         return math.nan
     return found.length_mm - segment.lower_bound_mm

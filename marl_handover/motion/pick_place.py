@@ -26,7 +26,7 @@ JOINED_RAD = 1e-9
 def timed_phases(paths: PickPlacePaths, arm: ArmModel, motion: MotionConfig, pick_height_mm: float) -> tuple[Phase, ...]:
     """The timed phases of a cycle, in the order of :data:`~marl_handover.motion.trajectory.PHASES`.
 
-    Approach, transfer and retreat each go from rest to rest, as fast as the limits allow: ``motion.velocity_share`` of the URDF's joint
+    Approach, transfer and retreat each go from rest to rest, as fast as the limits allow: ``motion.velocity_scale`` of the URDF's joint
     velocities, ``motion.acceleration_deg_s2``. The transfer is one motion without a stop; what it does below :data:`LIFTED_MM` at its
     beginning and at its end is named lift and lower. A transfer that never comes so high is all transfer, and one that has left that
     height, or is back, within one sample lacks the piece.
@@ -69,10 +69,10 @@ def timed_phases(paths: PickPlacePaths, arm: ArmModel, motion: MotionConfig, pic
 
 def motion_limits(arm: ArmModel, motion: MotionConfig) -> tuple[Floats, Floats]:
     """Velocity and acceleration limits (5,) in rad/s and rad/s^2. Raises :class:`InvalidSetting`."""
-    require_between("motion.velocity_share", motion.velocity_share, 0.01, 1.0)
+    require_between("motion.velocity_scale", motion.velocity_scale, 0.01, 1.0)
     require_positive("motion.acceleration_deg_s2", motion.acceleration_deg_s2)
     velocities = np.array([arm.description.joint(name).velocity for name in ARM_JOINTS])
-    return motion.velocity_share * velocities, np.full(len(ARM_JOINTS), math.radians(motion.acceleration_deg_s2))
+    return motion.velocity_scale * velocities, np.full(len(ARM_JOINTS), math.radians(motion.acceleration_deg_s2))
 
 
 def _still(q: Floats, from_mm: float, to_mm: float, duration_s: float, sample_s: float) -> tuple[Floats, Floats, Floats]:

@@ -117,7 +117,7 @@ class MotionPlanner:
             return plan_slsqp(segment, tolerance_mm=PAPER_TOLERANCE_MM)
         if math.dist(pick_mm, place_mm) < STILL_MM:
             guesses = iter([np.linspace(segment.ends[0], segment.ends[1], SAMPLES)])
-        return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.starts)
+        return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.num_initial_guesses)
 
     def carrying(self, arm: int, pick_mm: Floats, place_mm: Floats, other_joints_rad: Floats) -> tuple[Segment, Iterator[Floats]]:
         """The segment of a transfer and its first guesses."""
@@ -137,7 +137,7 @@ class MotionPlanner:
     def reach(self, arm: int, joints_rad: Floats, pin_mm: Floats, other_joints_rad: Floats, *, leaving: bool) -> FoundPath:
         """The path of the empty hand from ``joints_rad`` to the pin, or, ``leaving``, from it to them. Raises as :meth:`plan_paths`."""
         segment, guesses = self.reaching(arm, joints_rad, pin_mm, other_joints_rad, leaving=leaving)
-        return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.starts, wanted=1)
+        return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.num_initial_guesses, wanted=1)
 
     def reaching(
         self, arm: int, joints_rad: Floats, pin_mm: Floats, other_joints_rad: Floats, *, leaving: bool

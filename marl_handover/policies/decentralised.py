@@ -18,7 +18,7 @@ from marl_handover.task.observations import ARM_FIELDS, observe
 from marl_handover.task.rules import Rules
 
 FINISH, PASS, PLACE = 0, 1, 2
-"""An arm's branches, as the networks have them (``marl_handover.learning.turn_networks``)."""
+"""An arm's branches, as the networks have them (``marl_handover.baselines.decentralised``)."""
 
 
 class TurnsPolicy(NetworkPolicy):
@@ -58,15 +58,15 @@ class TurnsPolicy(NetworkPolicy):
         return np.stack(found, -2)
 
     def _said(self, pose: Floats, goal: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Logits (..., arms, 2 + modes) of each arm's branches, and its places (..., arms, modes, 2) on the table."""
+        """Logits (..., arms, 2 + components) of each arm's branches, and its places (..., arms, components, 2) on the table."""
         both = observe(self.rules, "relative", pose, goal, np.full(np.shape(pose)[:-1], NO_ARM)).astype(np.float32)
         blocks = both.reshape(*both.shape[:-1], -1, len(ARM_FIELDS))
         sign = self._sign(blocks)
         out = self._asked(self._harmonics(np.where(sign[..., None] < 0, blocks * self.odd, blocks)))
-        modes = self.about["modes"]
-        places = np.tanh(out[..., PLACE + modes : PLACE + 3 * modes]).reshape(*out.shape[:-1], modes, 2)
+        components = self.about["modes"]
+        places = np.tanh(out[..., PLACE + components : PLACE + 3 * components]).reshape(*out.shape[:-1], components, 2)
         signs = np.stack(np.broadcast_arrays(sign, self.beta_sign), -1)
-        return out[..., : PLACE + modes], places * signs[..., None, :]
+        return out[..., : PLACE + components], places * signs[..., None, :]
 
     @staticmethod
     def _decision(arm: NDArray[np.int64], branch: NDArray[np.int64], places: NDArray[np.float32]) -> Floats:

@@ -1,4 +1,4 @@
-"""Trained policies that choose from a grid of places, evaluated in numpy (:mod:`marl_handover.learning.dqn`)."""
+"""Trained policies that choose from a grid of places, evaluated in numpy (:mod:`marl_handover.baselines.dqn`)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.learning.dqn_grid import goal_reach, grid_actions, seen_by_finishers
+from marl_handover.baselines.dqn_grid import goal_reach, grid_actions, seen_by_finishers
 from marl_handover.policies.files import network_layers
 from marl_handover.policies.network import NetworkPolicy
 from marl_handover.policies.policy import Floats

@@ -65,25 +65,25 @@ class NetworkPolicy(SupervisorPolicy):
         return x @ weight + bias
 
     def _branches(self, observation: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Logits (..., arms * (1 + modes)) of the choices (arm, final or mode), and places (..., arms * modes, 2) on the table."""
-        modes = self.about["modes"]
+        """Of the choices (arm, final or component): logits (..., arms * (1 + components)), and places (..., arms * components, 2)."""
+        components = self.about["modes"]
         blocks = observation.reshape(*observation.shape[:-1], -1, len(ARM_FIELDS))
         sign = self._sign(blocks)
         turned = np.where(sign[..., None] < 0, blocks * self.odd, blocks)
         out = self._forward(self._harmonics(turned))
-        logits = out[..., : 1 + modes]
+        logits = out[..., : 1 + components]
         if self.rules.external_finish:
             logits[..., 0] = -math.inf
-        mean = np.tanh(out[..., 1 + modes : 1 + 3 * modes]).reshape(*out.shape[:-1], modes, 2)
+        mean = np.tanh(out[..., 1 + components : 1 + 3 * components]).reshape(*out.shape[:-1], components, 2)
         signs = np.stack(np.broadcast_arrays(sign, self.beta_sign), -1)
         place = mean * signs[..., None, :]
         return logits.reshape(*logits.shape[:-2], -1), place.reshape(*place.shape[:-3], -1, 2)
 
     def _action(self, branch: NDArray[np.int64], place: NDArray[np.float32]) -> Floats:
         """Actions (..., 4) of branches (...)."""
-        modes = self.about["modes"]
-        arm, choice = np.divmod(branch, 1 + modes)
-        index = arm * modes + np.maximum(choice - 1, 0)
+        components = self.about["modes"]
+        arm, choice = np.divmod(branch, 1 + components)
+        index = arm * components + np.maximum(choice - 1, 0)
         where = np.take_along_axis(place, np.asarray(index)[..., None, None], -2)[..., 0, :]
         return np.stack([np.where(choice == 0, 1.0, -1.0), 2.0 * arm - 1.0, where[..., 0], where[..., 1]], -1)
 

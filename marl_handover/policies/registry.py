@@ -148,7 +148,7 @@ def _arrays(name: str) -> Arrays:
         return read_policy(package_path(f"pretrained/{name.removeprefix('pretrained_')}.npz"))
     path = expanded(name)
     if path.is_dir():
-        from marl_handover.learning.export import run_arrays
+        from marl_handover.learning.checkpoint import run_arrays
 
         arrays = run_arrays(path)
         require_policy(arrays, path, "policy of the run")

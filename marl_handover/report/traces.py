@@ -160,7 +160,7 @@ def errors_at_end(trace: Trace, symmetry_order: int) -> tuple[Floats, Floats]:
 
 def as_seen(cell: Cell, poses: Floats) -> Floats:
     """Measured poses (n, 3) as the closed loop shows them to a policy: those just out of reach at the edge of it."""
-    edge_mm = LoopConfig().edge_mm
+    edge_mm = LoopConfig().reach_slack_mm
     return np.stack([drawn_in(cell, pose, edge_mm) for pose in poses]) if len(poses) else poses
 
 

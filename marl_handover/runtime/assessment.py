@@ -26,8 +26,7 @@ from marl_handover.config import (
 )
 from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.settings import HardwareConfig
-from marl_handover.learning.evaluation import Evaluation, decision_time, evaluate, random_problems, read_problems
-from marl_handover.learning.trace import Trace
+from marl_handover.learning.evaluation import Evaluation, Trace, decision_time, evaluate, random_problems, read_problems
 from marl_handover.policies import SupervisorPolicy
 from marl_handover.progress import Bar
 from marl_handover.runtime.paths import PathLengths

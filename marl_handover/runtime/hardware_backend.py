@@ -198,13 +198,13 @@ class HardwareBackend:
 
     def _block_watch(self, before: Floats) -> Callable[[float], bool]:
         """Says, once in a while during an approach, whether the block is no longer where it was."""
-        next_s = self.config.glance_s
+        next_s = self.config.poll_period_s
 
         def moved(t_s: float) -> bool:
             nonlocal next_s
             if t_s < next_s:
                 return False
-            next_s = t_s + self.config.glance_s
+            next_s = t_s + self.config.poll_period_s
             now = self.lab.watcher.glance()
             if now is None or not self._apart(before, now):
                 return False
@@ -217,7 +217,7 @@ class HardwareBackend:
         """Look until the block lies still."""
         view = self.lab.watcher.look()
         if view.block is None:
-            raise BlockNotSeen(view.camera_works, self.config.patience_s)
+            raise BlockNotSeen(view.camera_works, self.config.timeout_s)
         self._last, self._unseen = _Sighted(view.block, self.clock.now_s()), False
         self.log.add(Event.SEEN, pose=view.block, goal=view.goal)
         return view.block.copy()
@@ -242,7 +242,7 @@ class HardwareBackend:
                 return Refusal.STALLED
             return Refusal.MISSED_GRASP
         self._idle[arm] = 0
-        if math.dist(after[:2], place_mm) > self.config.missed_mm:
+        if math.dist(after[:2], place_mm) > self.config.lost_threshold_mm:
             self.log.add(Event.DROPPED, arm=arm, pose=after, place=place_mm)
             return Refusal.DROPPED
         return None
@@ -262,7 +262,7 @@ class HardwareBackend:
     def _wait_for_reach(self) -> None:
         """Somebody has to put the block back."""
         self.log.add(Event.BLOCK_OUTSIDE, pose=self._last.pose)
-        end_s = self.clock.now_s() + self.config.patience_s
+        end_s = self.clock.now_s() + self.config.timeout_s
         while not self._reached() and self.clock.now_s() < end_s:
             self.lab.driver.wait(10 * self.config.frame_s)
             self._look()

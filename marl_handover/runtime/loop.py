@@ -174,7 +174,7 @@ class ClosedLoop:
         return True
 
     def _seen(self, run: _Run) -> Floats:
-        return drawn_in(self.rules.cell, run.pose, self.settings.edge_mm)
+        return drawn_in(self.rules.cell, run.pose, self.settings.reach_slack_mm)
 
     @staticmethod
     def _record(run: _Run, order: Order, done: Done, verdict: Verdict) -> None:

@@ -159,7 +159,7 @@ class Mover:
 
     def _arm(self) -> None:
         """Make the first moves, once whoever is asked has seen to it that they are safe; a board may still be booting."""
-        end_s = self.lab.clock.now_s() + self.lab.config.watch.patience_s
+        end_s = self.lab.clock.now_s() + self.lab.config.watch.timeout_s
         while True:
             try:
                 if self.driver.state in (State.LOST, State.DISCONNECTED):

@@ -43,7 +43,7 @@ class Portrait:
         self.digest, self.backend, self._desk = Digest(), backend, desk
         self._policy = deepcopy(loop.policy)
         """Of its own: asking the session's would change what one that draws lots does next."""
-        self._edge_mm = loop.settings.edge_mm
+        self._edge_mm = loop.settings.reach_slack_mm
         self._about: dict[str, Any] = {"architecture": loop.rules.config.architecture}
         self._armed = False
         self._foreseen_for: Any = None

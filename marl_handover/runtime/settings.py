@@ -37,17 +37,17 @@ class WatchConfig:
     steady_mm: float = bounded(0.6, 1e-3, 1000.0)
     steady_deg: float = bounded(0.8, 1e-3, 360.0)
     hidden_s: float = bounded(1.0, 0.001, 600.0)  # arms parked and no steady sighting for this long: something is wrong, and said
-    glance_s: float = bounded(0.25, 1e-3, 60.0)  # between two glances at the block while a hand comes near
-    patience_s: float = bounded(15.0, 0.001, 3600.0)  # how long a camera, a block or a person is waited for
+    poll_period_s: float = bounded(0.25, 1e-3, 60.0)  # between two glances at the block while a hand comes near
+    timeout_s: float = bounded(15.0, 0.001, 3600.0)  # how long a camera, a block or a person is waited for
     moved_mm: float = bounded(4.0, 1e-3, 1000.0)  # nearer than this, or ...
     moved_deg: float = bounded(5.0, 1e-3, 360.0)  # ... turned by less, the block has not been moved
-    missed_mm: float = bounded(12.0, 1e-3, 1000.0)  # a block this far from where it was to be put down was lost on the way
+    lost_threshold_mm: float = bounded(12.0, 1e-3, 1000.0)  # a block this far from where it was to be put down was lost on the way
     failures: int = bounded(3, 1, 1000)  # transfers of one arm in a row that did not move the block: the arm is stalled
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` on a value out of its limits."""
         check_bounds(self, "watch.")
-        require_between("watch.patience_s", self.patience_s, self.hidden_s, 3600)
+        require_between("watch.timeout_s", self.timeout_s, self.hidden_s, 3600)
 
 
 @dataclass
@@ -75,11 +75,11 @@ class CardConfig:
 
     def validate(self, target: TargetConfig) -> None:
         """Raise :class:`InvalidSetting` on a value out of its limits, or a marker that means something else in ``target``."""
-        check_bounds(self, "cards.")
+        check_bounds(self, "hand_markers.")
         count, taken = MARKERS[target.dictionary], {target.block_id, target.goal_id}
         if len(self.ids) != len(ARMS) or len({*self.ids} - taken) != len(ARMS) or not all(0 <= number < count for number in self.ids):
             wanted = f"two different numbers from 0 to {count - 1} that are neither target.block_id nor target.goal_id"
-            raise InvalidSetting("cards.ids", self.ids, wanted)
+            raise InvalidSetting("hand_markers.ids", self.ids, wanted)
 
 
 @dataclass
@@ -95,7 +95,7 @@ class LabConfig:
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     watch: WatchConfig = field(default_factory=WatchConfig)
-    cards: CardConfig = field(default_factory=CardConfig)
+    hand_markers: CardConfig = field(default_factory=CardConfig)
     mount: MountConfig = field(default_factory=MountConfig)  # of the twin
     look: LookConfig = field(default_factory=LookConfig)  # of the twin
     twin: TwinConfig = field(default_factory=TwinConfig)
@@ -114,7 +114,7 @@ class LabConfig:
         check_bounds(self)
         for part in (self.hardware, self.board, self.target, self.detector, self.tracker, self.watch, self.mount, self.look, self.twin):
             part.validate()
-        self.cards.validate(self.target)
+        self.hand_markers.validate(self.target)
         if self.watch.steady_frames < self.tracker.frozen_frames:
             raise InvalidSetting(
                 "watch.steady_frames", self.watch.steady_frames, f"at least tracker.frozen_frames = {self.tracker.frozen_frames}"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.learning.trace import judged_by
+from marl_handover.learning.evaluation import judged_by
 from marl_handover.runtime.episode import Episode, Transfer
 from marl_handover.task.rules import Outcome, Rules
 

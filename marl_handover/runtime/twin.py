@@ -132,7 +132,7 @@ class Twin:
 
     def glue_cards(self) -> None:
         """Somebody glues the marker cards onto the hands, as exactly as people do."""
-        cards, people = self.config.cards, self.config.twin
+        cards, people = self.config.hand_markers, self.config.twin
         self._cards = []
         for number in cards.ids:
             off = self._random.normal(size=3) * (people.card_sd_mm, people.card_sd_mm, math.radians(people.card_sd_deg))

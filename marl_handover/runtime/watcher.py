@@ -62,7 +62,7 @@ class Watcher:
         """
         config = self.config
         begin_s = missing_s = news_s = self.clock.now_s()
-        end_s = begin_s + (config.patience_s if patience_s is None else patience_s)
+        end_s = begin_s + (config.timeout_s if patience_s is None else patience_s)
         kept: list[Floats] = []
         trouble: Event | None = None
         while True:

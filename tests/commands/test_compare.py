@@ -141,12 +141,12 @@ def test_a_changed_row_is_refused_and_made_anew_on_request(home, tmp_path, capsy
     assert main(arguments) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1
-    for word in ("random/kinematic", "episodes = 40", "now it is 50", "fresh=[random/kinematic]"):
+    for word in ("random/kinematic", "episodes = 40", "now it is 50", "overwrite=[random/kinematic]"):
         assert word in err
     assert results(home) == before
-    assert main([*arguments, "fresh=[random/kinematic]"]) == 0
+    assert main([*arguments, "overwrite=[random/kinematic]"]) == 0
     assert [run["evaluations"]["kinematic"]["episodes"] for run in results(home)["rows"][0]["runs"]] == [50, 50]
-    assert compared(home, "fresh=[random]") == 0
+    assert compared(home, "overwrite=[random]") == 0
 
 
 def test_a_failing_row_does_not_stop_the_others(tmp_path, capsys):
@@ -176,8 +176,8 @@ def test_the_smoke_size_has_a_folder_and_fewer_seeds_of_its_own(tmp_path, monkey
     [
         ("preset=small", "full, quick"),
         ("rows=[c]", "b, exact, random"),
-        ("fresh=[c]", "exact, exact/kinematic, exact/noise"),
-        ("fresh=[exact/shielded]", "exact/noise"),
+        ("overwrite=[c]", "exact, exact/kinematic, exact/noise"),
+        ("overwrite=[exact/shielded]", "exact/noise"),
         ("seeds=-1", "seeds"),
         ("address=auto", "launcher=loky"),
         ("launcher=slurm", "loky, ray"),
@@ -197,9 +197,9 @@ def test_bad_input_is_one_line_and_exit_2(tmp_path, capsys, argument, word):
 
 def test_fresh_knows_which_evaluations_a_row_has(tmp_path, capsys):
     (tmp_path / "small.yaml").write_text(SUITE)
-    assert compared(tmp_path, "fresh=[random/noise]") == 2
+    assert compared(tmp_path, "overwrite=[random/noise]") == 2
     assert "random/kinematic" in capsys.readouterr().err
-    assert compared(tmp_path, "fresh=[random]", "report_only=true") == 2
+    assert compared(tmp_path, "overwrite=[random]", "report_only=true") == 2
     assert "makes nothing anew" in capsys.readouterr().err
 
 
@@ -210,7 +210,7 @@ def test_nothing_is_thrown_away_before_there_is_somebody_to_make_it_anew(tmp_pat
     (tmp_path / "small.yaml").write_text(SUITE)
     assert compared(tmp_path, "rows=[exact]", "seeds=1") == 0
     before = (tmp_path / "out/exact/seed0/kinematic.json").read_bytes()
-    assert compared(tmp_path, "rows=[exact]", "seeds=1", "fresh=[exact]", *wrong.split()) != 0
+    assert compared(tmp_path, "rows=[exact]", "seeds=1", "overwrite=[exact]", *wrong.split()) != 0
     assert (tmp_path / "out/exact/seed0/kinematic.json").read_bytes() == before
     assert "Traceback" not in capsys.readouterr().err
 
@@ -253,7 +253,7 @@ def test_a_run_that_cannot_be_read_is_told_and_the_others_are_reported(home, cap
     metrics.write_bytes(kept + kept)
     assert compared(home) == 1
     err = capsys.readouterr().err
-    for word in ("1 of 6 runs failed", "b/seed0: cannot be read", "metrics.csv", "fresh=[b]"):
+    for word in ("1 of 6 runs failed", "b/seed0: cannot be read", "metrics.csv", "overwrite=[b]"):
         assert word in err
     found = results(home)
     assert (list(found["failures"]), found["missing"]) == (["b/seed0"], ["b/seed0"])

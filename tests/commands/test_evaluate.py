@@ -16,8 +16,7 @@ from marl_handover.cli import main
 from marl_handover.compose import compose
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.learning import evaluation
-from marl_handover.learning.algorithm_settings import ALGORITHMS
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.learning.trainer import Trainer
 from marl_handover.motion.path_length_table import cache_file, path_length_table, settings_key
 from marl_handover.task.rules import Rules
@@ -361,10 +360,10 @@ def test_transfers_are_priced_as_the_arms_move(tmp_path, monkeypatch):
         (["backend=noisy", "loop.transfers=0"], "loop.transfers"),
         (["backend=noisy", "motion.lift_mm=nan"], "motion.lift_mm"),
         (["backend=noisy", "motion.parked_deg=[0,0,0,0,0]"], "motion.parked_deg"),
-        (["backend=noisy", "loop.edge_mm=2"], "loop.edge_mm"),
+        (["backend=noisy", "loop.reach_slack_mm=2"], "loop.reach_slack_mm"),
         (["backend=noisy", "max_steps=31"], "loop.transfers = 30: must be at least task.max_steps = 31"),
         (["backend=kinematic", "loop.transfers=-4", "motion.method=nonsense", "motion.lift_mm=-5"], "loop.transfers = -4"),
-        (["loop.edge_mm=0.5"], "left out with backend=kinematic"),
+        (["loop.reach_slack_mm=0.5"], "left out with backend=kinematic"),
         (["motion.method=paper"], "motion.method"),
         (["motion.parked_deg=[0,120,-115,70,0]"], "motion.parked_deg"),
         (["motion.lift_mm=nan"], "motion.lift_mm"),

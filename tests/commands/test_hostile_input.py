@@ -66,7 +66,7 @@ LINES = [
     ([*TUNE, "storage=/dev/full"], "no regular file"),
     (["tune", "study=../..", "trials=1"], "study = '../..': must be a name"),
     (["calibrate", "what=sheets", "hardware.name=../.."], "hardware.name = '../..': must be a name"),
-    (["calibrate", "what=sheets", "hardware=twin", "calibration=c", "cards.ids=[[1,2],[3]]"], "cards.ids"),
+    (["calibrate", "what=sheets", "hardware=twin", "calibration=c", "hand_markers.ids=[[1,2],[3]]"], "hand_markers.ids"),
     (["calibrate", "what=sheets", "hardware=twin", "calibration=c", "target.goal_mm=1e9"], "target.goal_mm"),
     (["simulate", "cell.block.pin_diameter_mm=-1"], "cell.block.pin_diameter_mm"),
     (["simulate", "cell.urdf=mesh.urdf", "seed=1", "progress=false"], "every mesh it names"),

@@ -139,9 +139,9 @@ def policy_file(tmp_path_factory):
     """An untrained network of architecture A for the al5a cell, made for epsilon = 7 deg."""
     from marl_handover.cell import cell_config, load_cell
     from marl_handover.config import TaskConfig
-    from marl_handover.learning.export import policy_arrays, save_policy
+    from marl_handover.learning.checkpoint import policy_arrays, save_policy
     from marl_handover.learning.settings import TrainConfig
-    from marl_handover.learning.variants import Variant
+    from marl_handover.learning.variant import Variant
     from marl_handover.task.rules import Rules
 
     config = TrainConfig(cell=cell_config("al5a"), task=TaskConfig(architecture="A", epsilon_deg=7.0), compile="off")

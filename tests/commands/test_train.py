@@ -15,13 +15,13 @@ import yaml
 from marl_handover.cli import main
 from marl_handover.commands.train import SCHEMA
 from marl_handover.compose import compose
-from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.recorder import COLUMNS
+from marl_handover.learning.settings import ALGORITHMS
 from marl_handover.policies import load
 
 TINY = (
     *("preset=smoke", "progress=false", "steps=768", "num_envs=16", "evaluation_interval=256", "checkpoint_interval=256"),
-    *("evaluation_episodes=20", "algorithm.learning_starts=300", "algorithm.steps_per_update=32", "algorithm.batch_size=32"),
+    *("evaluation_episodes=20", "algorithm.learning_starts=300", "algorithm.env_steps_per_gradient_step=32", "algorithm.batch_size=32"),
 )
 
 
@@ -147,8 +147,8 @@ def test_a_run_is_not_overwritten(finished, capsys):
         ("algorithm.gamma=0", ("algorithm.gamma",)),
         ("algorithm.learning_rate=nan", ("algorithm.learning_rate",)),
         ("algorithm.batch_size=0", ("algorithm.batch_size",)),
-        ("algorithm.steps_per_update=0", ("algorithm.steps_per_update",)),
-        ("algorithm.modes=0", ("algorithm.modes",)),
+        ("algorithm.env_steps_per_gradient_step=0", ("algorithm.env_steps_per_gradient_step",)),
+        ("algorithm.mixture_components=0", ("algorithm.mixture_components",)),
         ("algorithm.layout=raw", ("algorithm.layout", "relative")),
         ("resume=nowhere", ("nowhere",)),
         ("centralised.motion=flat", ("centralised.motion", "variant=centralised")),

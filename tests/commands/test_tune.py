@@ -27,7 +27,7 @@ replay.symmetry: {type: categorical, choices: [false, true]}
 """
 TINY = (
     *("preset=smoke", "progress=false", "steps=256", "num_envs=16", "evaluation_interval=64", "evaluation_episodes=20", "jobs=1"),
-    *("algorithm.learning_starts=64", "algorithm.steps_per_update=32", "algorithm.batch_size=32", "epsilon_deg=9"),
+    *("algorithm.learning_starts=64", "algorithm.env_steps_per_gradient_step=32", "algorithm.batch_size=32", "epsilon_deg=9"),
 )
 WAIT_S = 120
 

@@ -223,7 +223,7 @@ def test_a_changed_row_is_refused_by_name_and_key(home, old, new, what, key):
     assert what in str(caught.value)
     assert key in str(caught.value)
     name = what.split()[1]
-    assert f"fresh=[{name}]" in str(caught.value)
+    assert f"overwrite=[{name}]" in str(caught.value)
     check_unchanged(task, [name])
 
 
@@ -260,7 +260,7 @@ def test_another_file_of_the_same_name_is_a_change(tmp_path, monkeypatch):
         check_unchanged(planned(tmp_path, text)["mine"])
     Path("mine.jsonl").unlink()
     shutil.copy(package_path("pretrained/twin.npz"), "mine.npz")
-    with pytest.raises(ChangedRow, match=r"content of policy.*fresh=\[mine/chosen\]"):
+    with pytest.raises(ChangedRow, match=r"content of policy.*overwrite=\[mine/chosen\]"):
         check_unchanged(planned(tmp_path, text)["mine"])
     Path("mine.npz").unlink()
     check_unchanged(planned(tmp_path, text)["mine"])

@@ -21,8 +21,7 @@ from marl_handover.compare.tune import ChangedStudy, Search, prepare, run_trial,
 from marl_handover.compare.tune_space import applied, load_space, value_of
 from marl_handover.compare.tune_storage import TRIES, abandoned, claimed, counted, give_back, hidden, located, open_study, place_of, running
 from marl_handover.errors import CorruptFile, UnknownKey
-from marl_handover.learning.algorithm_settings import ALGORITHMS, OffPolicyConfig
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.settings import ALGORITHMS, OffPolicyConfig, TrainConfig
 from marl_handover.learning.trainer import validation_score
 from marl_handover.resources import resource_path
 
@@ -34,7 +33,7 @@ def training(algorithm="sac"):
     config = TrainConfig(algorithm=ALGORITHMS[algorithm](), steps=256, num_envs=16, evaluation_interval=64, evaluation_episodes=20)
     config.algorithm.batch_size = 32
     if isinstance(config.algorithm, OffPolicyConfig):
-        config.algorithm.learning_starts, config.algorithm.steps_per_update = 64, 32
+        config.algorithm.learning_starts, config.algorithm.env_steps_per_gradient_step = 64, 32
     config.compile = "off"
     return config
 

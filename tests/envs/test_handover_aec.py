@@ -539,7 +539,7 @@ def test_programming_errors_raise(model):
         ({"architecture": "C"}, UnknownChoice, "architecture"),
         ({"cell": "moon"}, UnknownChoice, "cell"),
         ({"motion": MotionConfig(lift_mm=-5.0)}, InvalidSetting, "motion.lift_mm"),
-        ({"motion": MotionConfig(velocity_share=math.nan)}, InvalidSetting, "motion.velocity_share"),
+        ({"motion": MotionConfig(velocity_scale=math.nan)}, InvalidSetting, "motion.velocity_scale"),
         ({"backend_options": {"check_collisions": "often"}}, InvalidSetting, "check_collisions"),
         ({"refused_reward": 1.0}, InvalidSetting, "refused_reward"),
         ({"refused_reward": math.nan}, InvalidSetting, "refused_reward"),

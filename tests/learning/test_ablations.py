@@ -13,10 +13,10 @@ from marl_handover import policies
 from marl_handover.config import NoiseConfig, TaskConfig
 from marl_handover.envs import SupervisorEnv
 from marl_handover.errors import InvalidSetting
+from marl_handover.learning.checkpoint import policy_arrays, save_policy
 from marl_handover.learning.evaluation import evaluate, random_problems
-from marl_handover.learning.export import policy_arrays, save_policy
 from marl_handover.learning.trainer import Trainer
-from marl_handover.learning.variants import make_variant
+from marl_handover.learning.variant import make_variant
 from marl_handover.policies import SupervisorPolicy
 from marl_handover.policies.baselines import ExactPolicy
 from marl_handover.task.observations import ARM_FIELDS, RAW_FIELDS, observe
@@ -42,7 +42,7 @@ def test_previous_arm_is_hidden_from_learner_memory_and_policy_alike(small, pape
         trainer._advance()
     columns = [index for index, name in enumerate(2 * ARM_FIELDS) if "previous" in name]
     batch = trainer.replay.sample(500)
-    for vector in (batch["observation"], batch["next", "observation"], trainer.experience.current["observation"]):
+    for vector in (batch["observation"], batch["next", "observation"], trainer.collector.current["observation"]):
         assert not vector[:, columns].any()
     assert (batch["next", "previous_arm"] >= 0).any()
     save_policy(tmp_path / "policy.npz", policy_arrays(trainer.algorithm, trainer.config, "a test"))
@@ -81,10 +81,10 @@ def test_exploration_by_area_is_that_of_the_blind_start_and_of_random_places(sma
     tips = {}
     for name in ("chart", "area"):
         (tmp_path / name).mkdir()
-        own = (f"algorithm.{share}=1", "algorithm.greedy_share=0") if algorithm == "sac" else (f"algorithm.{share}=1",)
+        own = (f"algorithm.{share}=1", "algorithm.deterministic_env_fraction=0") if algorithm == "sac" else (f"algorithm.{share}=1",)
         learner = Trainer(small(algorithm, f"algorithm.exploration={name}", *own), tmp_path / name).algorithm
         observation = torch.randn(4000, 38, generator=torch.Generator().manual_seed(0))
-        for when, action in (("blind", learner.blind(observation)), ("later", learner.explore(observation))):
+        for when, action in (("blind", learner.random_action(observation)), ("later", learner.explore(observation))):
             alpha = action[:, 2]
             tips[name, when] = (alpha.abs() > 0.8)[alpha.abs() < 1].float().mean().item()  # sac puts a share on the very edge
     for when in ("blind", "later"):
@@ -119,7 +119,7 @@ def test_the_supervisor_sees_the_object_displaced_and_the_truth_goes_on():
 
 
 def test_memory_shows_the_noise_anew_and_judges_the_truth(small, tmp_path):
-    trainer = Trainer(small("box_sac", "algorithm.layout=raw", "task.noise.observed_mm=5", "replay.hindsight.strategy=none"), tmp_path)
+    trainer = Trainer(small("flat_sac", "algorithm.layout=raw", "task.noise.observed_mm=5", "replay.hindsight.strategy=none"), tmp_path)
     trainer.curriculum.enter(0)
     while len(trainer.replay) < 300:
         trainer._advance()

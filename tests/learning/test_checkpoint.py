@@ -63,7 +63,7 @@ def killed_after(config, folder, monkeypatch):
 
 @pytest.mark.parametrize(
     ("algorithm", "architecture"),
-    [("sac", "B"), ("td3", "B"), ("ppo", "B"), pytest.param("box_sac", "B", marks=SLOW), pytest.param("sac", "A", marks=SLOW)],
+    [("sac", "B"), ("td3", "B"), ("ppo", "B"), pytest.param("flat_sac", "B", marks=SLOW), pytest.param("sac", "A", marks=SLOW)],
 )
 def test_a_resumed_run_is_the_uninterrupted_run(small, table, tmp_path, monkeypatch, algorithm, architecture):
     """In one go, and as a checkpoint with 100 steps lost and done again: the same weights, counters and table."""

@@ -8,7 +8,7 @@ import torch
 from scipy.stats import kstest
 
 from marl_handover.errors import InvalidSetting, UnknownChoice
-from marl_handover.learning.exploration import Places, UniformActions
+from marl_handover.learning.algorithm import Places, UniformActions
 from marl_handover.task.rules import Rules
 
 

@@ -9,7 +9,7 @@ import torch
 
 from marl_handover.learning.hybrid_sac import HybridSac, chosen_action, squashed_sample, unpacked
 from marl_handover.learning.networks import arm_blocks
-from marl_handover.learning.variants import Variant
+from marl_handover.learning.variant import Variant
 from marl_handover.task.observations import observe
 
 
@@ -21,7 +21,7 @@ def replay(replay_of, request):
 @pytest.fixture
 def learner(replay, small) -> HybridSac:
     torch.manual_seed(1)
-    config = small("sac", "algorithm.modes=2", "algorithm.candidates=4")
+    config = small("sac", "algorithm.mixture_components=2", "algorithm.candidates=4")
     return Variant().algorithm(replay.rules, config, torch.Generator().manual_seed(2))
 
 
@@ -43,13 +43,13 @@ def same(one, other):
 
 
 def noise_of(learner, batch):
-    return learner._noise((len(batch), 2, learner.config.modes, 2))
+    return learner._noise((len(batch), 2, learner.config.mixture_components, 2))
 
 
 def critic_loss(learner, batch, **changed):
     torch.manual_seed(5)
     present, following = unpacked(batch)
-    noise = torch.randn(len(batch), 2, learner.config.modes, 2)
+    noise = torch.randn(len(batch), 2, learner.config.mixture_components, 2)
     return learner.loss.critic_loss(present, {**following, **changed}, noise)
 
 
@@ -172,7 +172,7 @@ def test_value_is_the_mean_over_sampled_branches(learner, batch, replay):
 
 
 def test_exploration_draws_the_branches_by_their_probability(learner, batch):
-    learner.config.random_place = learner.config.greedy_share = 0.0
+    learner.config.random_place = learner.config.deterministic_env_fraction = 0.0
     observation = batch["observation"][:1].expand(20_000, -1)
     action = learner.explore(observation)
     probability = learner.loss.actor(observation[:1]).logits.flatten().softmax(-1).view(2, -1)

@@ -31,8 +31,15 @@ def random_rate(rules):
 
 
 def test_hybrid_sac_solves_15_degrees_in_3072_steps(small, tmp_path):
-    networks = ("actor_hidden=[64,64]", "critic_hidden=[64,64]", "candidates=4", "modes=1", "learning_rate=1e-3", "actor_tau=0.05")
-    pace = ("learning_starts=500", "steps_per_update=8", "batch_size=96", "gamma=0.95", "reward_scale=0.5")
+    networks = (
+        "actor_hidden=[64,64]",
+        "critic_hidden=[64,64]",
+        "candidates=4",
+        "mixture_components=1",
+        "learning_rate=1e-3",
+        "actor_tau=0.05",
+    )
+    pace = ("learning_starts=500", "env_steps_per_gradient_step=8", "batch_size=96", "gamma=0.95", "reward_scale=0.5")
     trainer, rate = learned(small, tmp_path, "sac", 3072, 15, *networks, *pace)
     assert rate > 0.8  # (0.98, 0.98, 0.99)
     assert random_rate(trainer.rules) < 0.1
@@ -44,7 +51,7 @@ def test_ppo_beats_random_actions(small, tmp_path):
 
 
 def test_a_training_that_diverges_says_so_and_stops(small, tmp_path):
-    made = Trainer(small("box_sac", "steps=512", "evaluation_interval=256"), tmp_path)
+    made = Trainer(small("flat_sac", "steps=512", "evaluation_interval=256"), tmp_path)
     made.config.algorithm.learning_rate = 1e30  # beyond the bounds of the setting: within them nothing diverges so soon
     with pytest.raises(Diverged, match=r"diverged before step 256: loss_\w+ = (nan|inf).*learning_rate") as told:
         made.run()
@@ -54,12 +61,12 @@ def test_a_training_that_diverges_says_so_and_stops(small, tmp_path):
 
 @pytest.mark.slow
 def test_td3_beats_random_actions(small, tmp_path):
-    trainer, rate = learned(small, tmp_path, "td3", 6144, 60, "learning_rate=1e-3", "learning_starts=1000", "steps_per_update=4")
+    trainer, rate = learned(small, tmp_path, "td3", 6144, 60, "learning_rate=1e-3", "learning_starts=1000", "env_steps_per_gradient_step=4")
     assert rate > random_rate(trainer.rules) + 0.1  # (0.59, 0.42 at 4096 steps; random 0.12)
 
 
 @pytest.mark.slow
-def test_box_sac_beats_random_actions(small, tmp_path):
-    pace = ("learning_rate=1e-3", "learning_starts=1000", "steps_per_update=5", "reward_scale=0.2", "gamma=0.9")
-    trainer, rate = learned(small, tmp_path, "box_sac", 10_240, 60, *pace)
+def test_flat_sac_beats_random_actions(small, tmp_path):
+    pace = ("learning_rate=1e-3", "learning_starts=1000", "env_steps_per_gradient_step=5", "reward_scale=0.2", "gamma=0.9")
+    trainer, rate = learned(small, tmp_path, "flat_sac", 10_240, 60, *pace)
     assert rate > random_rate(trainer.rules) + 0.07  # (0.31, 0.27; random 0.12)

@@ -10,8 +10,8 @@ from torch.nn import functional as F
 from torchrl.modules import TanhNormal
 
 from marl_handover.learning.hybrid_sac import squashed_sample
-from marl_handover.learning.networks import Branches, Harmonics, HybridActor, TwinMLP, arm_blocks
-from marl_handover.learning.variants import Variant
+from marl_handover.learning.networks import ActionDistribution, AngleFeatures, HybridActor, TwinMLP, arm_blocks
+from marl_handover.learning.variant import Variant
 from marl_handover.task.observations import ARM_FIELDS, observe
 from tests.symmetries import GROUP, flips_x
 
@@ -36,11 +36,11 @@ def seen(rules, pose, goal, previous, symmetry):
 @pytest.mark.parametrize("can_finish", [True, False])
 def test_actor_is_equivariant(cell, rules_of, draw, symmetry, can_finish):
     rules = rules_of(cell)
-    actor = HybridActor(cell, [24, 24], modes=2, can_finish=can_finish, canonical=True, harmonics=2).double()
+    actor = HybridActor(cell, [24, 24], components=2, can_finish=can_finish, canonical=True, harmonics=2).double()
     problem = problems(draw, cell)
     plain, mirrored = actor(seen(rules, *problem, GROUP[0])), actor(seen(rules, *problem, symmetry))
     if symmetry.swaps:
-        plain = Branches(*(part.flip(1) for part in plain))
+        plain = ActionDistribution(*(part.flip(1) for part in plain))
     sign = torch.tensor([-1.0 if flips_x(symmetry) else 1.0, -1.0 if symmetry.swaps else 1.0]).double()
     torch.testing.assert_close(mirrored.logits, plain.logits)
     torch.testing.assert_close(mirrored.mean, plain.mean * sign)
@@ -50,7 +50,7 @@ def test_actor_is_equivariant(cell, rules_of, draw, symmetry, can_finish):
 
 
 def test_actor_that_does_not_fold_is_not_equivariant_along_the_base_line(paper, rules_of, draw):
-    actor = HybridActor(paper, [24, 24], modes=1, can_finish=True, canonical=False, harmonics=2).double()
+    actor = HybridActor(paper, [24, 24], components=1, can_finish=True, canonical=False, harmonics=2).double()
     problem, rules = problems(draw, paper), rules_of(paper)
     logits = {symmetry: actor(seen(rules, *problem, symmetry)).logits for symmetry in GROUP}
     along, across = (next(s for s in GROUP if (flips_x(s), s.swaps) == kind) for kind in ((True, False), (False, True)))
@@ -94,7 +94,7 @@ def test_a_gradient_of_one_twin_leaves_the_other_alone():
 
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_harmonics_are_the_doubled_angles(count):
-    harmonics = Harmonics(count)
+    harmonics = AngleFeatures(count)
     angles = torch.rand(50, 2, dtype=torch.float64) * 2 * math.pi
     block = torch.randn(50, len(ARM_FIELDS), dtype=torch.float64)
     for column, name in enumerate(("finish_error", "hand_over")):
@@ -112,7 +112,7 @@ def test_harmonics_are_the_doubled_angles(count):
 def test_density_of_places_integrates_to_one(mean, log_std):
     raw = torch.linspace(mean - 9 * math.exp(log_std), mean + 9 * math.exp(log_std), 20_001, dtype=torch.float64)
     noise = ((raw - mean) / math.exp(log_std))[:, None, None, None]
-    branches = Branches(torch.zeros(1), torch.full_like(noise, mean), torch.full_like(noise, log_std))
+    branches = ActionDistribution(torch.zeros(1), torch.full_like(noise, mean), torch.full_like(noise, log_std))
     place, log_prob = squashed_sample(branches, noise)
     torch.testing.assert_close(place.flatten(), raw.tanh())
     assert float(torch.trapezoid(log_prob.flatten().exp(), place.flatten())) == pytest.approx(1.0, abs=1e-4)
@@ -121,6 +121,6 @@ def test_density_of_places_integrates_to_one(mean, log_std):
 def test_density_of_places_is_torchrls():
     mean, log_std, noise = torch.randn(3, 40, 2, 3, 2, dtype=torch.float64)
     log_std = 0.5 * log_std - 0.5
-    place, log_prob = squashed_sample(Branches(torch.zeros(1), mean, log_std), noise)
+    place, log_prob = squashed_sample(ActionDistribution(torch.zeros(1), mean, log_std), noise)
     torch.testing.assert_close(log_prob, TanhNormal(mean, log_std.exp()).log_prob(place), rtol=1e-4, atol=1e-4)
-    assert torch.isfinite(squashed_sample(Branches(torch.zeros(1), 1000 * mean, log_std), noise)[1]).all()
+    assert torch.isfinite(squashed_sample(ActionDistribution(torch.zeros(1), 1000 * mean, log_std), noise)[1]).all()

@@ -144,7 +144,7 @@ def test_a_table_of_another_shape_or_not_finite_is_refused(table, tmp_path):
 def test_the_key_follows_what_the_paths_depend_on(paper):
     key = tables.settings_key(paper, MOTION)
     config = paper.config
-    same = [(replace(paper, config=replace(config, name="else", chart_inset=0.9)), MOTION), (paper, replace(MOTION, velocity_share=0.5))]
+    same = [(replace(paper, config=replace(config, name="else", chart_inset=0.9)), MOTION), (paper, replace(MOTION, velocity_scale=0.5))]
     assert {tables.settings_key(*settings) for settings in same} == {key}
     others = [
         (replace(paper, config=replace(config, pick_height_mm=50.0)), MOTION),

@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 PICK_MM = 45.0
 ARM = build_cell(cell_config("paper")).arm
 MOTION = MotionConfig()
-VELOCITY = MOTION.velocity_share * np.array([ARM.description.joint(name).velocity for name in ARM_JOINTS])
+VELOCITY = MOTION.velocity_scale * np.array([ARM.description.joint(name).velocity for name in ARM_JOINTS])
 ACCELERATION = math.radians(MOTION.acceleration_deg_s2)
 
 
@@ -135,7 +135,7 @@ def test_slower_limits_make_a_longer_cycle() -> None:
     paths = cycle_paths((-0.7, 0.7), (170.0, 170.0))
     ends = [
         timed_phases(paths, ARM, replace(MOTION, **change), PICK_MM)[-1].t_s[-1]
-        for change in ({}, {"acceleration_deg_s2": 400.0}, {"velocity_share": 0.2})
+        for change in ({}, {"acceleration_deg_s2": 400.0}, {"velocity_scale": 0.2})
     ]
     assert ends[0] < min(ends[1:])
 
@@ -143,8 +143,8 @@ def test_slower_limits_make_a_longer_cycle() -> None:
 @pytest.mark.parametrize(
     ("change", "name"),
     [
-        ({"velocity_share": 0.0}, "velocity_share"),
-        ({"velocity_share": 1.2}, "velocity_share"),
+        ({"velocity_scale": 0.0}, "velocity_scale"),
+        ({"velocity_scale": 1.2}, "velocity_scale"),
         ({"acceleration_deg_s2": math.nan}, "acceleration_deg_s2"),
         ({"sample_s": 0.0}, "sample_s"),
         ({"grasp_s": -1.0}, "fingers"),

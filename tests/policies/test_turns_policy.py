@@ -10,18 +10,16 @@ import pytest
 import torch
 
 from marl_handover import cli, policies
+from marl_handover.baselines.decentralised import FINISH, PASS, PLACE, Decentralised
 from marl_handover.commands.plan import solve
 from marl_handover.compose import compose
 from marl_handover.config import DecentralisedConfig
 from marl_handover.envs.decentralised import TurnRules, own_view
 from marl_handover.errors import CheckpointMismatch
-from marl_handover.learning.algorithm_settings import ALGORITHMS
-from marl_handover.learning.decentralised import Decentralised
+from marl_handover.learning.checkpoint import policy_arrays, run_arrays, save_policy
 from marl_handover.learning.evaluation import evaluate
-from marl_handover.learning.export import policy_arrays, run_arrays, save_policy
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.learning.trainer import Trainer
-from marl_handover.learning.turn_networks import FINISH, PASS, PLACE
 from marl_handover.policies import decentralised
 from marl_handover.policies.policy import NobodyMoves
 from marl_handover.task.episode import nobody_moves, play
@@ -56,7 +54,7 @@ def made(paper, draw, tmp_path_factory):
     return make
 
 
-@pytest.mark.parametrize("settings", [(), ("algorithm.modes=3",), ("algorithm.canonical=false", "algorithm.harmonics=0")])
+@pytest.mark.parametrize("settings", [(), ("algorithm.mixture_components=3",), ("algorithm.canonical=false", "algorithm.harmonics=0")])
 @pytest.mark.parametrize("learners", LEARNERS)
 def test_the_policy_asks_the_torch_actors_in_turn(paper, draw, made, learners, settings):
     algorithm, path = made(learners, *settings)
@@ -94,7 +92,7 @@ def test_evaluation_and_validation_play_the_same_episodes(paper, draw, made, lea
     assert len(set(found.outcome.tolist())) >= 2
 
 
-@pytest.mark.parametrize("settings", [(), ("algorithm.modes=3",)])
+@pytest.mark.parametrize("settings", [(), ("algorithm.mixture_components=3",)])
 @pytest.mark.parametrize("learners", LEARNERS)
 def test_alternatives_are_all_that_the_networks_have_but_passing(paper, draw, made, learners, settings):
     _, path = made(learners, *settings)

@@ -114,7 +114,7 @@ def joints_of(seen: Seen):
 def rates_limits(cell: InteractiveCell):
     """Velocity and acceleration limits (5,), from the URDF and the settings."""
     velocities = np.array([cell.model.arm.description.joint(name).velocity for name in ARM_JOINTS])
-    return cell.motion.velocity_share * velocities, math.radians(cell.motion.acceleration_deg_s2)
+    return cell.motion.velocity_scale * velocities, math.radians(cell.motion.acceleration_deg_s2)
 
 
 def least_gaps_mm(cell: InteractiveCell, seen: Seen):

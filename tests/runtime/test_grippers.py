@@ -33,7 +33,7 @@ def hands(twin_calibration, tmp_path, model, planner):
         config = twin_lab()
         config.calibration, config.watch, config.hardware.stop_file = (
             str(twin_calibration),
-            WatchConfig(patience_s=4.0),
+            WatchConfig(timeout_s=4.0),
             str(tmp_path / "s"),
         )
         backend = HardwareBackend(model, MotionConfig(), config=config, grippers=False)

@@ -40,7 +40,7 @@ def one_transfer(cell, start=START, place_mm=PLACE_MM, arm=0):
 
 def lab_config(folder, stop, **hardware):
     config = twin_lab()
-    config.calibration, config.watch = str(folder), WatchConfig(patience_s=4.0)
+    config.calibration, config.watch = str(folder), WatchConfig(timeout_s=4.0)
     config.hardware.stop_file = str(stop)
     config.hardware.timeouts.reconnect_s = 4.0
     for name, value in hardware.items():

@@ -47,8 +47,8 @@ def test_dictionaries_have_as_many_markers_as_is_said():
 )
 def test_cards_that_cannot_be_are_refused(changes):
     for config in (twin_lab(), real_lab()):
-        config.cards = CardConfig(**changes)
-        with pytest.raises(InvalidSetting, match=f"cards.{next(iter(changes))}"):
+        config.hand_markers = CardConfig(**changes)
+        with pytest.raises(InvalidSetting, match=f"hand_markers.{next(iter(changes))}"):
             config.validate()
 
 
@@ -81,5 +81,5 @@ def test_a_real_cell_refuses_what_only_the_twin_has(setting, tmp_path, capsys):
 
 
 def test_sheets_are_not_printed_of_cards_that_cannot_be(tmp_path, capsys):
-    assert main(["calibrate", "what=sheets", f"calibration={tmp_path}", "cards.ids=[2]"]) == 2
-    assert "cards.ids" in capsys.readouterr().err
+    assert main(["calibrate", "what=sheets", f"calibration={tmp_path}", "hand_markers.ids=[2]"]) == 2
+    assert "hand_markers.ids" in capsys.readouterr().err

@@ -301,7 +301,7 @@ def test_an_object_just_outside_all_reach_is_still_taken(planner, rim, off_mm):
     episode = loop.play(start, GOAL)
     assert episode.transfers[0].done.refusal is None
     assert cell.reaches(loop.policy.seen[0][0]).any()
-    far = replace(loop.settings, edge_mm=0.2)
+    far = replace(loop.settings, reach_slack_mm=0.2)
     assert ClosedLoop(loop.policy, planner, loop.backend, far).play(start, GOAL).transfers[0].done.refusal == Refusal.OUT_OF_REACH
 
 
@@ -332,7 +332,8 @@ def test_inexact_arms_keep_away_from_the_edge_of_the_chart():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("transfers", 0), ("chart_inset", 1.2), ("edge_mm", -1.0), ("edge_mm", 1.01), ("edge_mm", math.nan)]
+    ("name", "value"),
+    [("transfers", 0), ("chart_inset", 1.2), ("reach_slack_mm", -1.0), ("reach_slack_mm", 1.01), ("reach_slack_mm", math.nan)],
 )
 def test_settings_out_of_their_limits_are_named(name, value):
     with pytest.raises(InvalidSetting, match=rf"loop\.{name}"):
@@ -340,9 +341,9 @@ def test_settings_out_of_their_limits_are_named(name, value):
 
 
 def test_the_supervisor_may_be_shown_an_object_as_far_off_as_an_arm_accepts_it():
-    LoopConfig(edge_mm=END_TOLERANCE_MM).validate()
-    with pytest.raises(InvalidSetting, match=r"loop\.edge_mm"):
-        LoopConfig(edge_mm=math.nextafter(END_TOLERANCE_MM, math.inf)).validate()
+    LoopConfig(reach_slack_mm=END_TOLERANCE_MM).validate()
+    with pytest.raises(InvalidSetting, match=r"loop\.reach_slack_mm"):
+        LoopConfig(reach_slack_mm=math.nextafter(END_TOLERANCE_MM, math.inf)).validate()
 
 
 def test_fewer_transfers_than_the_task_allows_are_refused(planner):

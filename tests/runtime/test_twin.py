@@ -105,7 +105,7 @@ def test_cards_and_boards_are_seen_and_never_laid_exactly(twin):
     bare = twin.camera.read().image
     twin.glue_cards()
     assert (twin.camera.read().image != bare).mean() > 0.0
-    off = [np.linalg.norm(T[:3, 3] - twin.config.cards.place_mm) for _, T in twin._cards]
+    off = [np.linalg.norm(T[:3, 3] - twin.config.hand_markers.place_mm) for _, T in twin._cards]
     assert all(0.0 < value < 2.0 for value in off)
     twin.take_cards_off()
     assert not twin._cards

@@ -38,7 +38,7 @@ class Stage:
         tracker = Tracker(Detector(painter.renderer.calibration, model.cell.config.block))
         camera = RenderedCamera(self.picture, 0.2, self.clock.now_s)
         self.log = EventLog(self.clock.now_s)
-        self.watcher = Watcher(camera, tracker, self.clock, WatchConfig(patience_s=3.0), self.log)
+        self.watcher = Watcher(camera, tracker, self.clock, WatchConfig(timeout_s=3.0), self.log)
 
     def picture(self):
         now_s = self.clock.now_s()
@@ -144,7 +144,7 @@ def live(model, painter):
     camera = LiveCamera(device, warm_up_s=0.0, max_age_s=1e6, timeout_s=600.0, clock=clock.now_s)
     log = EventLog(clock.now_s)
     tracker = Tracker(Detector(painter.renderer.calibration, model.cell.config.block))
-    watcher = Watcher(camera, tracker, clock, WatchConfig(picture_s=0.1, patience_s=1.0), log)
+    watcher = Watcher(camera, tracker, clock, WatchConfig(picture_s=0.1, timeout_s=1.0), log)
     yield watcher, device
     camera.close()
 

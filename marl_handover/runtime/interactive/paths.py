@@ -131,7 +131,7 @@ class FreePaths:
         return time_path(found.points, self.motion.degree, self.velocity_rad_s, self.acceleration_rad_s2, STEP_S)
 
     def _found(self, segment: Segment, guesses: Iterator[Floats], wanted: int = 2) -> FoundPath:
-        return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.starts, wanted=wanted)
+        return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.num_initial_guesses, wanted=wanted)
 
     def _profile(self, joints_rad: Floats, end_mm: Floats, scale_mm: float, lift_mm: float, ground_mm: float) -> Floats:
         """The lift-over of an empty hand: it asks for nothing where the hand is, nor near a pin."""

@@ -17,7 +17,7 @@ from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import TaskConfig
 from marl_handover.envs import handover_aec
-from marl_handover.learning.turns import TurnReader, agent_turns
+from marl_handover.learning.aec_transitions import TransitionReader
 from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.task.rules import Rules
 
@@ -94,15 +94,15 @@ def read(turns):
 @given(steps=plays(), number=st.integers(0, 2))
 def test_a_reader_that_goes_step_by_step_finds_the_same(steps, number):
     """An agent's decision that is followed by its own turn at once ends there; one that is cut off before is dropped."""
-    assert read(agent_turns(rolled(steps), AGENTS[number])) == by_hand(steps, number)
+    assert read(TransitionReader(AGENTS[number]).read(rolled(steps))) == by_hand(steps, number)
 
 
 @given(steps=plays(), number=st.integers(0, 2), borders=st.sets(st.integers(1, 11)))
 def test_batch_borders_do_not_matter(steps, number, borders):
-    whole, reader = rolled(steps), TurnReader(AGENTS[number])
+    whole, reader = rolled(steps), TransitionReader(AGENTS[number])
     edges = [0, *sorted(borders), 12]
     batches = [read(reader.read(whole[:, first:last])) for first, last in pairwise(edges)]
-    assert sorted(chain(*batches)) == sorted(read(agent_turns(whole, AGENTS[number])))
+    assert sorted(chain(*batches)) == sorted(read(TransitionReader(AGENTS[number]).read(whole)))
     ends = [[(row[0], row[3]) for row in batch] for batch in batches]
     for batch, (first, last) in zip(ends, pairwise(edges), strict=True):
         assert batch == sorted(batch)
@@ -112,9 +112,9 @@ def test_batch_borders_do_not_matter(steps, number, borders):
 def test_several_leading_dimensions_and_none_are_environments():
     steps = [[(0, time, time % 3, (time + 1) % 3, "", [1, 2, 3], 0) for time in range(12)]] * 4
     four = rolled(steps)
-    square = agent_turns(four.reshape(2, 2, 12), "supervisor")
+    square = TransitionReader("supervisor").read(four.reshape(2, 2, 12))
     assert square["cell"].tolist() == [0] * 4 + [1] * 4 + [2] * 4 + [3] * 4
-    one = agent_turns(four[0], "supervisor")
+    one = TransitionReader("supervisor").read(four[0])
     assert read(one) == [(0.0, 3.0 * turn, 3.0, 3 * turn + 2.5, False, False) for turn in range(4)]
 
 
@@ -182,7 +182,7 @@ def test_the_supervisors_are_the_rule_books_transition_for_transition(architectu
     The state is seen in float32: rounding at a threshold would show as another verdict, and does in none of these.
     """
     batches, rules = batches_of(model, architecture, seed, frames, 40 // frames)
-    reader = TurnReader("supervisor")
+    reader = TransitionReader("supervisor")
     turns = torch.cat([reader.read(batch) for batch in batches])
     steps = torch.cat(batches)
     asked = int(steps["supervisor", "mask"].sum())
@@ -214,7 +214,7 @@ def test_arms_have_turns_of_their_own(arm, model):
     """From one of its turns to its next, be there others' between; what it earned is its path, paid at once."""
     (steps,), _ = batches_of(model, "B", 3, 200, 1, finals=0.02)
     agent = AGENTS[1 + arm]
-    turns = agent_turns(steps, agent)
+    turns = TransitionReader(agent).read(steps)
     asked = steps[agent, "mask"][:, 0].nonzero()[:, 0]
     assert 15 < len(turns) <= len(asked)
     torch.testing.assert_close(turns["action", "paths"], steps[agent, "action", "paths"][asked[: len(turns)], 0])

@@ -32,7 +32,7 @@ class Collected(NamedTuple):
     ended: Tensor
 
 
-class Experience(ABC):
+class Collector(ABC):
     """A source of transitions that a checkpoint can hold."""
 
     @abstractmethod
@@ -51,7 +51,7 @@ class Experience(ABC):
         """Let go of processes, if it has any."""
 
 
-class BatchedExperience(Experience):
+class BatchedCollector(Collector):
     """One step of every cell of a batched environment.
 
     Args:

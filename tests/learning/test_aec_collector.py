@@ -22,12 +22,11 @@ from marl_handover.commands import train
 from marl_handover.compose import compose
 from marl_handover.config import MotionConfig, NoiseConfig
 from marl_handover.errors import HandoverError
-from marl_handover.learning import aec_experience
-from marl_handover.learning.aec_experience import AecExperience, WorkerLost
-from marl_handover.learning.aec_policy import WorkerPolicy, make_env, message
-from marl_handover.learning.experience import BatchedExperience
+from marl_handover.learning import aec_collector
+from marl_handover.learning.aec_collector import AecCollector, WorkerLost, WorkerPolicy, make_env, message
+from marl_handover.learning.collector import BatchedCollector
 from marl_handover.learning.trainer import Trainer
-from marl_handover.learning.variants import make_variant
+from marl_handover.learning.variant import make_variant
 
 HOWTO = Path(__file__).resolve().parents[2] / "docs" / "howto-aec.md"
 architectures = pytest.mark.parametrize("architecture", ["A", "B"])
@@ -43,7 +42,7 @@ def begin(small):
         config.validate()
         variant = make_variant(config.variant)
         env = variant.env(config, torch.device("cpu"))
-        experience = variant.experience(env, config)
+        experience = variant.collector(env, config)
         open_ones.append(experience)
         return experience, variant.algorithm(env.rules, config, torch.Generator().manual_seed(config.seed))
 
@@ -63,7 +62,7 @@ def gather(experience, explore, calls):
 def test_rows_are_the_rule_books(architecture, begin):
     """Every command of every whole episode, once and in order, with what it did; episodes as long as they are."""
     experience, learner = begin(f"task.architecture={architecture}", "task.max_steps=6", "num_envs=12", "task.epsilon_deg=20")
-    rows, steps, ended = gather(experience, learner.blind, 15)
+    rows, steps, ended = gather(experience, learner.random_action, 15)
     rules = experience.env.rules
     first, last = rows["elapsed"][:, 0] == 0, rows["remaining"][:, 0] == 0
     assert len(rows) <= steps <= len(rows) + 12 * 6
@@ -93,13 +92,13 @@ def test_rows_are_the_rule_books(architecture, begin):
 def test_rows_look_like_the_batched_environments(begin, small):
     """Same keys, types and shapes, so that a replay memory takes either."""
     experience, learner = begin()
-    rows, _, _ = gather(experience, learner.blind, 2)
+    rows, _, _ = gather(experience, learner.random_action, 2)
     config = small("sac")
     config.validate()
-    batched = make_variant(config.variant).experience(experience.env, config)
-    assert isinstance(experience, AecExperience)
-    assert isinstance(batched, BatchedExperience)
-    other, _, _ = gather(batched, learner.blind, 3)
+    batched = make_variant(config.variant).collector(experience.env, config)
+    assert isinstance(experience, AecCollector)
+    assert isinstance(batched, BatchedCollector)
+    other, _, _ = gather(batched, learner.random_action, 3)
 
     def looks(data):
         return {key: (value.dtype, value.shape[1:]) for key, value in data.items()}
@@ -112,7 +111,7 @@ def test_the_same_seed_brings_the_same_rows(begin):
     for seed in (3, 3, 4):
         experience, learner = begin(f"seed={seed}")
         learner.generator.manual_seed(0)
-        found.append(gather(experience, learner.blind, 3)[0])
+        found.append(gather(experience, learner.random_action, 3)[0])
     assert (found[0] == found[1]).all()
     assert found[0].shape != found[2].shape or not (found[0]["achieved_goal"] == found[2]["achieved_goal"]).all()
 
@@ -124,7 +123,7 @@ def test_epsilons_follow_the_curriculum_and_are_seen(begin):
 
     def explore(observation):
         seen.append(observation)
-        return learner.blind(observation)
+        return learner.random_action(observation)
 
     experience.env.set_epsilon_range(2.0, 2.0)
     first, _, _ = gather(experience, explore, 2)
@@ -138,12 +137,12 @@ def test_epsilons_follow_the_curriculum_and_are_seen(begin):
 
 def test_a_run_that_goes_on_begins_other_problems(begin):
     experience, learner = begin()
-    rows, steps, _ = gather(experience, learner.blind, 2)
+    rows, steps, _ = gather(experience, learner.random_action, 2)
     state = experience.state_dict()
     assert state["decisions"] == steps
     other, learner = begin()
     other.load_state_dict(state)
-    later, more, _ = gather(other, learner.blind, 2)
+    later, more, _ = gather(other, learner.random_action, 2)
     assert other.state_dict()["decisions"] == steps + more
     assert not set(map(tuple, rows["desired_goal"].tolist())) & set(map(tuple, later["desired_goal"].tolist()))
 
@@ -163,7 +162,7 @@ def test_a_run_that_goes_on_draws_the_memorys_next_epsilons(begin):
 
 def test_a_command_that_was_ignored_is_told_from_one_that_an_arm_refused(begin):
     experience, learner = begin("task.architecture=A", "num_envs=12", "task.epsilon_deg=60", "task.max_steps=6")
-    rows, _, _ = gather(experience, learner.blind, 12)
+    rows, _, _ = gather(experience, learner.random_action, 12)
     rules = experience.env.rules
     problem = rows["achieved_goal"].double(), rows["desired_goal"].double()
     solved = rules.can_finish(*problem).any(-1)
@@ -192,7 +191,9 @@ def test_workers_explore_as_far_as_training_is(small):
 
 
 def test_a_run_learns_from_it_stops_and_goes_on(small, tmp_path, table):
-    config = small("sac", "source=aec", "steps=320", "evaluation_interval=160", "checkpoint_interval=160", "algorithm.steps_per_update=32")
+    config = small(
+        "sac", "source=aec", "steps=320", "evaluation_interval=160", "checkpoint_interval=160", "algorithm.env_steps_per_gradient_step=32"
+    )
 
     def stop(row):
         if row["step"] < 200:
@@ -234,7 +235,7 @@ def test_what_cannot_be_is_refused_by_name(settings, name):
 def test_noisy_arms_are_judged_by_what_is_measured(begin):
     """A hand-over lands beside its place; a final one is good within the tolerance, and so is hindsight's, whose goal is where it aimed."""
     experience, learner = begin("backend=noisy", "task.noise.position_mm=2", "task.noise.yaw_deg=1", "num_envs=40")
-    rows, _, _ = gather(experience, learner.blind, 3)
+    rows, _, _ = gather(experience, learner.random_action, 3)
     rules = experience.env.rules
     assert rules.tolerance_mm == 5.0
     assert rules.cell.config.chart_inset == 0.99
@@ -271,7 +272,7 @@ def only_finishing(learner):
 
 def check_workers(experience, learner):
     """First uniform actions, then the new weights' own, of every worker."""
-    rows, steps, _ = gather(experience, learner.blind, 2)
+    rows, steps, _ = gather(experience, learner.random_action, 2)
     assert steps == 32
     assert 0.2 < float((rows["action"][:, 0] > 0).float().mean()) < 0.8
     only_finishing(learner)
@@ -290,8 +291,8 @@ def check_workers(experience, learner):
 @pytest.fixture
 def worker(monkeypatch):
     """A process that lives until it is killed."""
-    monkeypatch.setattr(aec_experience, "LOOK_S", 0.05)
-    monkeypatch.setattr(aec_experience, "GRACE_S", 0.2)
+    monkeypatch.setattr(aec_collector, "LOOK_S", 0.05)
+    monkeypatch.setattr(aec_collector, "GRACE_S", 0.2)
     process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(600,), daemon=True)
     process.start()
     yield process
@@ -302,18 +303,18 @@ def worker(monkeypatch):
 def test_what_never_comes_from_a_killed_worker_is_not_waited_for(worker):
     threading.Timer(0.3, lambda: os.kill(worker.pid, signal.SIGKILL)).start()
     with pytest.raises(ChildProcessError, match=f"process {worker.pid} ended with -9"):
-        aec_experience.watched(threading.Event().wait, lambda: [worker])
+        aec_collector.watched(threading.Event().wait, lambda: [worker])
 
 
 def test_what_living_workers_bring_is_waited_for_and_their_errors_are_passed_on(worker):
     brought = threading.Event()
     threading.Timer(0.4, brought.set).start()
-    assert aec_experience.watched(brought.wait, lambda: [worker]) is True
+    assert aec_collector.watched(brought.wait, lambda: [worker]) is True
     with pytest.raises(ZeroDivisionError):
-        aec_experience.watched(lambda: 1 / 0, lambda: [worker])
+        aec_collector.watched(lambda: 1 / 0, lambda: [worker])
     worker.kill()
     worker.join()
-    assert aec_experience.watched(lambda: "was under way", lambda: [worker]) == "was under way"
+    assert aec_collector.watched(lambda: "was under way", lambda: [worker]) == "was under way"
 
 
 def test_a_dead_ray_address_is_told_at_once_and_is_no_lost_worker(begin, monkeypatch):
@@ -328,7 +329,7 @@ def test_a_dead_ray_address_is_told_at_once_and_is_no_lost_worker(begin, monkeyp
 @pytest.mark.parametrize("moment_s", [0.0, 0.02, 0.05, 0.1, 0.3])
 def test_a_worker_killed_at_any_moment_ends_the_run(begin, moment_s):
     experience, learner = begin("collector=multiprocess")
-    gather(experience, learner.blind, 1)
+    gather(experience, learner.random_action, 1)
     workers = experience._collector.procs
     threading.Timer(moment_s, lambda: os.kill(workers[1].pid, signal.SIGKILL)).start()
     with pytest.raises(WorkerLost, match="resume=RUN"):
@@ -373,9 +374,9 @@ def test_bullet_brings_rows(collector, begin):
     experience, learner = begin("backend=bullet", "executor=optimised", f"collector={collector}", "num_envs=6")
 
     def explore(observation):
-        return learner.blind(observation)
+        return learner.random_action(observation)
 
-    rows, steps, _ = gather(experience, explore if collector == "local" else learner.blind, 3)
+    rows, steps, _ = gather(experience, explore if collector == "local" else learner.random_action, 3)
     rules = experience.env.rules
     planned, _ = rules.transfer(rows["achieved_goal"], rows["desired_goal"], rules.decode(rows["action"]))
     done = rows["feasible"][:, 0]
@@ -389,7 +390,7 @@ def test_bullet_brings_rows(collector, begin):
 def test_executors_take_the_motion_defaults(method, begin):
     """Either kind carries out what is feasible; the planner declines what it finds no path for."""
     experience, learner = begin(f"executor={method}", "num_envs=10")
-    rows, _, _ = gather(experience, learner.blind, 2)
+    rows, _, _ = gather(experience, learner.random_action, 2)
     rules = experience.env.rules
     _, feasible = rules.transfer(rows["achieved_goal"], rows["desired_goal"], rules.decode(rows["action"]))
     assert (feasible | ~rows["feasible"][:, 0]).all()

@@ -1,4 +1,6 @@
-"""Hybrid SAC for a policy that also moves: every branch has a tanh-Gaussian motion, given where the branch goes.
+"""``variant=centralised``: one policy decides and moves, and its motions are judged like the executors'.
+
+Hybrid SAC in which every branch has a tanh-Gaussian motion, given where the branch goes.
 
 V = sum_i p_i [Q_i - a_place log pi_i(place) - a_motion log pi_i(motion)] - a_branch sum_i p_i log p_i, exact over the branches i, with
 three temperatures. Q_i = (1 - r) V_i + r failure: V_i is the hierarchical critic's value of the branch if its motion can be made, r the
@@ -7,7 +9,7 @@ chance that it is refused. V_i learns from transfers that were made, r from all 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -15,21 +17,93 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
-from marl_handover.config import CentralisedConfig
+from marl_handover.baselines.flat_sac import FlatSac
+from marl_handover.cell import Cell, load_cell
+from marl_handover.config import CentralisedConfig, TaskConfig
 from marl_handover.envs.centralised import CentralisedRules
+from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.algorithm import Algorithm, compiled, stepped
-from marl_handover.learning.algorithm_settings import SacConfig
-from marl_handover.learning.box import BoxSac
-from marl_handover.learning.centralised_networks import MotionActor, MotionCritic
 from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, averaging, unpacked
-from marl_handover.learning.networks import arm_blocks, chosen_action, squashed_sample
-from marl_handover.learning.settings import TrainConfig
-from marl_handover.motion.transfer_features import mirrored_numbers
+from marl_handover.learning.networks import LOG_STD_RANGE, AfterstateCritic, HybridActor, arm_blocks, chosen_action, mlp, squashed_sample
+from marl_handover.learning.replay import HindsightReplayBuffer
+from marl_handover.learning.settings import SacConfig, TrainConfig
+from marl_handover.learning.variant import Variant
+from marl_handover.motion.transfer_features import FIELDS, mirrored_numbers, transfer_features
+from marl_handover.task.observations import ARM_FIELDS
 from marl_handover.task.rules import Rules
 
 
+class MotionActor(HybridActor):
+    """Decides as :class:`HybridActor` does, and draws the motion of a branch from the way it goes.
+
+    All that a motion earns is not to be refused, and that depends on both its ends in the acting arm's frame: its network sees no more.
+
+    Args:
+        cell: the cell.
+        config: of the learner.
+        count: numbers of a motion.
+    """
+
+    scale: Tensor
+
+    def __init__(self, cell: Cell, config: SacConfig, count: int) -> None:
+        super().__init__(cell, config.actor_hidden, config.mixture_components, True, config.canonical, config.harmonics)
+        self.cell, self.canonical, self.count = cell, config.canonical, count
+        self.move = mlp(len(FIELDS), config.actor_hidden, 2 * count)
+        last = self.move[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():  # all zeros to begin with: with offsets, the executors' first guess
+            last.weight.mul_(0.01)
+            last.bias.zero_()
+        self.places = [ARM_FIELDS.index(name) for name in ("x", "y", "goal_x", "goal_y")]
+        self.register_buffer("scale", torch.tensor([1.0, cell.arms[0].mirror] * 2) * cell.r_max_mm, persistent=False)
+
+    def positions(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """World positions (n, 2) in mm of object and goal, as observations (n, size) show them."""
+        seen = arm_blocks(observation)[..., 0, :][..., self.places] * self.scale
+        return seen[..., :2], seen[..., 2:]
+
+    def way(self, arm: Tensor, from_mm: Tensor, to_mm: Tensor) -> tuple[Tensor, Tensor]:
+        """Features (..., fields) and sign (...) of ways; see :func:`transfer_features`."""
+        return transfer_features(self.cell, arm, from_mm, to_mm, self.canonical)
+
+    def motion(self, way: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean before the tanh and log of the deviation, (..., M), of the motions for ways (..., fields), folded as they are."""
+        mean, log_std = self.move(way).chunk(2, -1)
+        return mean, log_std.clamp(*LOG_STD_RANGE)
+
+    def with_motion(self, observation: Tensor, decision: Tensor, noise: Tensor) -> Tensor:
+        """Actions (n, 4 + M) of decisions (n, 4); ``noise`` (n, M) in deviations."""
+        arm, final = (decision[:, 1] > 0).long(), decision[:, :1] > 0
+        start, goal = self.positions(observation)
+        place = self.cell.chart.to_table(decision[:, 2], decision[:, 3])
+        way, sign = self.way(arm, start, torch.where(final, goal, place))
+        mean, log_std = self.motion(way)
+        return torch.cat([decision, mirrored_numbers((mean + log_std.exp() * noise).tanh(), sign)], -1)
+
+
+class MotionCritic(AfterstateCritic):
+    """Twin values of the branches if their motions are made, and how likely those are to be refused.
+
+    What a refusal costs is known, and that it ends the episode; so the value of a branch is (1 - p) V + p failure. V is the
+    hierarchical critic; p is learned from what was refused.
+    """
+
+    def __init__(self, config: SacConfig, centralised: CentralisedConfig, count: int) -> None:
+        super().__init__(config.critic_hidden, config.final_hidden, config.canonical, config.harmonics)
+        self.refusal = mlp(len(FIELDS) + count, centralised.refusal_hidden, 1)
+
+    def refused_logit(self, way: Tensor, numbers: Tensor) -> Tensor:
+        """Log-odds (...) that motions (..., M) on ways (..., fields) are refused, both folded."""
+        logit: Tensor = self.refusal(torch.cat([way, numbers], -1))
+        return logit[..., 0]
+
+
 class Drawn(NamedTuple):
-    """What the policy would do in every branch, and what comes of it; soft value (n,), the others (n, arms, 1 + modes) or without final."""
+    """What the policy would do in every branch, and what comes of it.
+
+    The soft value is (n,), the others are (n, arms, 1 + components), or without final.
+    """
 
     value: Tensor
     probability: Tensor
@@ -53,7 +127,7 @@ class CentralisedSacLoss(HybridSacLoss):
         self.rules, self.config = rules, config
         self.actor, self.critic, self.target = actor, critic, target
         self.log_temperatures = nn.Parameter(torch.tensor(start).log())  # of places, of branches, of motions
-        self.noise_width = rules.cell.num_arms * (2 * actor.modes + (1 + actor.modes) * actor.count)
+        self.noise_width = rules.cell.num_arms * (2 * actor.components + (1 + actor.components) * actor.count)
         self.failure = config.reward_scale * rules.config.reward.failure
 
     def drawn(self, critic: MotionCritic, batch: dict[str, Tensor], noise: Tensor) -> Drawn:
@@ -83,7 +157,7 @@ class CentralisedSacLoss(HybridSacLoss):
         return Drawn(soft, probability, branch_entropy, place_log_prob, motion_log_prob, branches.mean.tanh())
 
     def _ways(self, observation: Tensor, place: Tensor) -> Tensor:
-        """Features (n, arms, 1 + modes, fields) of the ways of all branches, final ones first."""
+        """Features (n, arms, 1 + components, fields) of the ways of all branches, final ones first."""
         start, goal = self.actor.positions(observation)
         table = self.rules.cell.chart.to_table(place[..., 0], place[..., 1])
         to = torch.cat([goal[:, None, None].expand(*place.shape[:2], 1, 2), table], 2)
@@ -207,8 +281,8 @@ class CentralisedSac(HybridSac):
     def explore(self, observation: Tensor) -> Tensor:
         """A branch, a place and a motion drawn from the policy."""
         decision = super().explore(observation)
-        curious = torch.arange(len(observation), device=self.device) >= int(self.config.greedy_share * len(observation))
-        noise = self._noise((len(observation), self.count)) * curious[:, None]
+        exploring = torch.arange(len(observation), device=self.device) >= int(self.config.deterministic_env_fraction * len(observation))
+        noise = self._noise((len(observation), self.count)) * exploring[:, None]
         return self.loss.actor.with_motion(observation, decision, noise)
 
     @torch.no_grad()
@@ -247,7 +321,7 @@ class CentralisedSac(HybridSac):
         }
 
 
-class CentralisedBoxSac(BoxSac):
+class CentralisedFlatSac(FlatSac):
     """The literal formulation: one flat vector of all numbers, decision and motion, in one squashed Gaussian."""
 
     kind = "centralised_box"
@@ -264,3 +338,36 @@ class CentralisedBoxSac(BoxSac):
 def about_motions(settings: CentralisedConfig) -> dict[str, Any]:
     """The part of a policy file that says what its motions mean."""
     return {"centralised": vars(settings).copy()}
+
+
+class MotionReplayBuffer(HindsightReplayBuffer):
+    """Hindsight whose batches also say ``feasible``: a critic is to tell refusals from misses.
+
+    Goals change as ever. A motion that was allowed stays so, since the hand-over that becomes final goes the same way; a refused
+    transfer keeps its goal.
+    """
+
+    def _assembled(self, batch: TensorDictBase, reward: Tensor, terminated: Tensor) -> TensorDict:
+        assembled = super()._assembled(batch, reward, terminated)
+        assembled["feasible"] = batch["feasible"]
+        return assembled
+
+
+class Centralised(Variant):
+    """The centralised formulation; architecture B."""
+
+    algorithms: ClassVar[dict[str, Any]] = {"sac": CentralisedSac, "flat_sac": CentralisedFlatSac}
+
+    def rules(self, cell: Cell, task: TaskConfig, config: TrainConfig) -> CentralisedRules:
+        """The rule book with motions."""
+        return CentralisedRules(cell, task, config.centralised)
+
+    def env(self, config: TrainConfig, device: torch.device) -> SupervisorEnv:
+        """The batch of cells; their actions are decision and motion."""
+        cell = load_cell(config.cell)
+        rules = self.rules(cell, config.task, config)
+        return SupervisorEnv(config.num_envs, cell, config.task, device, seed=config.seed + 1, rules=rules)
+
+    def replay(self, env: SupervisorEnv, config: TrainConfig, generator: torch.Generator) -> MotionReplayBuffer:
+        """The memory that the learners draw from."""
+        return MotionReplayBuffer(env.rules, config.replay, env, generator)

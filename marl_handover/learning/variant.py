@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -19,15 +20,10 @@ from marl_handover.envs.backends import NoisyBackend
 from marl_handover.envs.handover_aec import HandoverEnv
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.errors import UnknownChoice
-from marl_handover.learning.algorithm import Algorithm
-from marl_handover.learning.algorithm_settings import OffPolicyConfig
-from marl_handover.learning.box import BoxSac, Td3
-from marl_handover.learning.dqn import Dqn
-from marl_handover.learning.experience import BatchedExperience, Experience
-from marl_handover.learning.hybrid_sac import HybridSac
-from marl_handover.learning.ppo import Ppo
+from marl_handover.learning.algorithm import LEARNERS, Algorithm
+from marl_handover.learning.collector import BatchedCollector, Collector
 from marl_handover.learning.replay import HindsightReplayBuffer
-from marl_handover.learning.settings import VARIANTS, TrainConfig
+from marl_handover.learning.settings import ALGORITHMS, VARIANTS, OffPolicyConfig, TrainConfig
 from marl_handover.task.episode import Act, Episodes, play
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Rules, carried
@@ -38,7 +34,8 @@ VALIDATION_NOISE_SEED = 2_000_000_001
 class Variant:
     """The hierarchical formulation, and the base of the others."""
 
-    algorithms: ClassVar[dict[str, type[Algorithm]]] = {"sac": HybridSac, "box_sac": BoxSac, "td3": Td3, "ppo": Ppo, "dqn": Dqn}
+    algorithms: ClassVar[Mapping[str, type[Algorithm]]] = LEARNERS
+    """Learners by the name of their algorithm."""
 
     def rules(self, cell: Cell, task: TaskConfig, config: TrainConfig) -> Rules:
         """The rule book that actions are judged by; prices of motions are the environment's matter."""
@@ -55,12 +52,12 @@ class Variant:
             rules = Rules(arms.rules.cell, task, arms.rules.motion_cost, physical=True)
         return SupervisorEnv(config.num_envs, load_cell(config.cell), config.task, device, seed=config.seed + 1, rules=rules)
 
-    def experience(self, env: SupervisorEnv, config: TrainConfig) -> Experience:
+    def collector(self, env: SupervisorEnv, config: TrainConfig) -> Collector:
         """Where transitions come from."""
         if config.source == "aec":
-            aec: type[Experience] = importlib.import_module("marl_handover.learning.aec_experience").AecExperience
+            aec: type[Collector] = importlib.import_module("marl_handover.learning.aec_collector").AecCollector
             return aec(env, config)  # type: ignore[call-arg]
-        return BatchedExperience(env, isinstance(config.algorithm, OffPolicyConfig))
+        return BatchedCollector(env, isinstance(config.algorithm, OffPolicyConfig))
 
     def replay(self, env: SupervisorEnv, config: TrainConfig, generator: torch.Generator) -> HindsightReplayBuffer:
         """The memory that off-policy learners draw from."""
@@ -69,6 +66,8 @@ class Variant:
     def algorithm(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> Algorithm:
         """The learner that ``config``, which is valid, names. Raises :class:`UnknownChoice` if this variant has none of that name."""
         name = config.algorithm.name
+        if name in ALGORITHMS:
+            ALGORITHMS[name]  # registers its learner
         if name not in self.algorithms:
             raise UnknownChoice(f"algorithm of variant={config.variant}", name, tuple(self.algorithms))
         return self.algorithms[name](rules, config, generator)
@@ -114,6 +113,6 @@ def make_variant(name: str) -> Variant:
         raise UnknownChoice("variant", name, tuple(VARIANTS))
     if name == "hierarchical":
         return Variant()
-    module = importlib.import_module(f"marl_handover.learning.{name}")
+    module = importlib.import_module(f"marl_handover.baselines.{name}")
     variant: Variant = getattr(module, name.capitalize())()
     return variant

@@ -9,8 +9,8 @@ import torch.nn.functional as F
 
 from marl_handover import policies
 from marl_handover.errors import InvalidSetting
+from marl_handover.learning.checkpoint import policy_arrays, run_arrays, save_policy
 from marl_handover.learning.evaluation import random_problems
-from marl_handover.learning.export import policy_arrays, run_arrays, save_policy
 from marl_handover.learning.trainer import Trainer
 from marl_handover.policies import RandomPolicy
 from marl_handover.policies.discrete import DiscretePolicy
@@ -29,7 +29,7 @@ def filled(small, tmp_path):
     def make(architecture, *overrides):
         trainer = Trainer(small("dqn", f"task.architecture={architecture}", *overrides), tmp_path)
         while len(trainer.replay) < 600:
-            collected = trainer.experience.collect(trainer.algorithm.blind)
+            collected = trainer.collector.collect(trainer.algorithm.random_action)
             if collected.rows is not None:
                 trainer.replay.extend(collected.rows)
         return trainer
@@ -234,7 +234,14 @@ def test_a_grid_that_cannot_be_is_named(small, tmp_path):
 @pytest.mark.parametrize("architecture", ["B", pytest.param("A", marks=pytest.mark.slow)])
 def test_it_beats_random_actions(small, tmp_path, architecture):
     stage = "curriculum=[{epsilon_low_deg:30,epsilon_high_deg:30}]"
-    own = ("layout=relative", "hidden=[64,64]", "batch_size=96", "learning_rate=2e-3", "learning_starts=500", "steps_per_update=6")
+    own = (
+        "layout=relative",
+        "hidden=[64,64]",
+        "batch_size=96",
+        "learning_rate=2e-3",
+        "learning_starts=500",
+        "env_steps_per_gradient_step=6",
+    )
     arguments = (f"task.architecture={architecture}", "task.epsilon_deg=30", stage, "num_envs=32", "steps=4096")
     watch = ("evaluation_episodes=300", "evaluation_interval=100000", "algorithm.grid_mm=40")
     trainer = Trainer(small("dqn", *arguments, *watch, *(f"algorithm.{setting}" for setting in own)), tmp_path)

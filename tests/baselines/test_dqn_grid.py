@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marl_handover.arrays import wrap
+from marl_handover.baselines.dqn_grid import finishing_potential, goal_reach, grid_actions, grid_points, grid_transfers, seen_by_finishers
 from marl_handover.errors import InvalidSetting
-from marl_handover.learning.dqn_grid import finishing_potential, goal_reach, grid_actions, grid_points, grid_transfers, seen_by_finishers
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.task.observations import ARM_FIELDS, observe
 from marl_handover.task.planner import ExactPlanner

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -10,15 +12,29 @@ from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from marl_handover.learning.algorithm import Algorithm
-from marl_handover.learning.algorithm_settings import PpoConfig
-from marl_handover.learning.box import box_spec
-from marl_handover.learning.networks import mlp
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.config import bounded
+from marl_handover.learning.algorithm import Algorithm, register_algorithm
+from marl_handover.learning.networks import action_spec, mlp
+from marl_handover.learning.settings import OnPolicyConfig, TrainConfig
 from marl_handover.task.observations import observation_size
 from marl_handover.task.rules import Rules
 
 
+@dataclass
+class PpoConfig(OnPolicyConfig):
+    """PPO with a clipped objective on the boxed action; on-policy, so no replay and no hindsight."""
+
+    name: str = "ppo"
+    learning_rate: float = bounded(5e-4, 1e-8, 10.0)
+    batch_size: int = bounded(512, 1, 65_536)
+    gae_lambda: float = bounded(0.95, 0.0, 1.0)
+    clip: float = bounded(0.2, 1e-6, 1e3)
+    entropy: float = bounded(0.003, 0.0, 1e3)
+    max_grad_norm: float = bounded(0.5, 1e-9, 1e9)
+    hidden: list[int] = bounded([256, 256], 1, 4096, (0, 8))
+
+
+@register_algorithm(PpoConfig)
 class Ppo(Algorithm):
     """On-policy: :meth:`update` takes a whole roll-out (num_envs, time)."""
 
@@ -86,5 +102,5 @@ class Ppo(Algorithm):
 def gaussian_policy(net: nn.Module, actions: int, device: torch.device) -> ProbabilisticActor:
     """Tanh-Gaussian policy of a network (n, size) -> (n, 2 * actions): means, then raw scales."""
     parameters = TensorDictModule(nn.Sequential(net, NormalParamExtractor()), in_keys=["observation"], out_keys=["loc", "scale"])
-    spec = box_spec(actions, device)
+    spec = action_spec(actions, device)
     return ProbabilisticActor(parameters, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True, spec=spec)

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from marl_handover import cli, policies
+from marl_handover.baselines.centralised import with_actions
 from marl_handover.commands.plan import solve
 from marl_handover.errors import InvalidSetting, UnknownChoice
 from marl_handover.learning.algorithm import stepped
-from marl_handover.learning.centralised_sac import with_actions
-from marl_handover.learning.export import policy_arrays, save_policy
+from marl_handover.learning.checkpoint import policy_arrays, save_policy
 from marl_handover.learning.trainer import Trainer
-from marl_handover.learning.variants import make_variant
+from marl_handover.learning.variant import make_variant
 from marl_handover.motion.transfer_features import mirrored_numbers
 from marl_handover.policies import SupervisorPolicy
 from marl_handover.runtime.assessment import AssessmentConfig, assess
@@ -40,14 +40,14 @@ def trainer(small, tmp_path_factory):
     made = Trainer(small("sac", VARIANT, "num_envs=64"), tmp_path_factory.mktemp("blind"))
 
     def explore(observation):
-        action = made.algorithm.blind(observation)
-        reach = made.rules.cell.reaches(made.experience.current["achieved_goal"])
+        action = made.algorithm.random_action(observation)
+        reach = made.rules.cell.reaches(made.collector.current["achieved_goal"])
         action[:, 1] = torch.where(reach[:, 0], -1.0, 1.0)
         action[:, 4:] *= 0.05
         return action
 
     for _ in range(50):
-        rows = made.experience.collect(explore).rows
+        rows = made.collector.collect(explore).rows
         if rows is not None:
             made.replay.extend(rows)
     return made
@@ -128,7 +128,7 @@ def test_a_motion_that_is_surely_refused_is_worth_the_failure(trainer):
     assert (values[0] > values[1]).float().mean() > 0.9
 
 
-@pytest.mark.parametrize("algorithm", ["sac", "box_sac"])
+@pytest.mark.parametrize("algorithm", ["sac", "flat_sac"])
 def test_one_seed_one_run(small, table, tmp_path, algorithm):
     runs = []
     for name in ("one", "two"):
@@ -144,7 +144,7 @@ def test_torchrls_own_call_gives_the_losses(trainer):
     assert losses["loss_actor"].requires_grad
 
 
-@pytest.mark.parametrize("algorithm", ["sac", "box_sac"])
+@pytest.mark.parametrize("algorithm", ["sac", "flat_sac"])
 @pytest.mark.parametrize("motion", ["flat", "offset"])
 def test_numpy_policy_is_the_torch_actor(small, draw, tmp_path, algorithm, motion):
     config = small(algorithm, VARIANT, f"centralised.motion={motion}", "centralised.offset_rad=0.3")

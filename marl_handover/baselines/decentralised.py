@@ -1,4 +1,6 @@
-"""Hybrid SAC for arms that take turns: an exact expectation over what *one* arm can choose, pass, finish or place.
+"""``variant=decentralised``: no supervisor; the arms take turns and each decides for itself.
+
+They learn by hybrid SAC, with an exact expectation over what *one* arm can choose, pass, finish or place.
 
 The discount is applied once a decision, whoever decides. Three kinds of learners:
 
@@ -10,22 +12,111 @@ and earned, is part of the environment.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from marl_handover.cell import NO_ARM
-from marl_handover.envs.decentralised import TurnRules
+from marl_handover.arrays import one_where
+from marl_handover.baselines.turn_replay import TurnReplay
+from marl_handover.cell import NO_ARM, Cell, load_cell
+from marl_handover.config import TaskConfig
+from marl_handover.envs.decentralised import DecentralisedEnv, TurnRules, own_view
+from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.algorithm import Algorithm, compiled, stepped
-from marl_handover.learning.algorithm_settings import SacConfig
+from marl_handover.learning.collector import BatchedCollector, Collector
 from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, SoftValue, averaging
-from marl_handover.learning.networks import Branches, arm_blocks, squashed_sample
-from marl_handover.learning.settings import TrainConfig
-from marl_handover.learning.turn_networks import PASS, PLACE, TurnActor, TurnCritic, turn_action
+from marl_handover.learning.networks import (
+    LOG_STD_RANGE,
+    ActionDistribution,
+    AfterstateCritic,
+    AngleFeatures,
+    Canonicalize,
+    TwinMLP,
+    arm_blocks,
+    mlp,
+    squashed_sample,
+)
+from marl_handover.learning.settings import SacConfig, TrainConfig
+from marl_handover.learning.variant import Variant
+from marl_handover.task.episode import Act
 from marl_handover.task.observations import ARM_FIELDS, observe
 from marl_handover.task.rules import Rules
+
+FINISH, PASS, PLACE = 0, 1, 2
+"""An arm's branches; its mixture components come from ``PLACE`` on."""
+
+
+class TurnActor(nn.Module):
+    """The policy of an arm, for its turn.
+
+    Args:
+        hidden: widths.
+        components: mixture components.
+        canonical: fold the symmetry M_x.
+        harmonics: see :class:`~marl_handover.learning.networks.AngleFeatures`.
+    """
+
+    def __init__(self, hidden: Sequence[int], components: int, canonical: bool, harmonics: int) -> None:
+        super().__init__()
+        self.components = components
+        self.canonicalize, self.features = Canonicalize(canonical), AngleFeatures(harmonics)
+        self.net = mlp(self.features.width, hidden, PLACE + 5 * components)
+        last = self.net[-1]
+        if components > 1 and isinstance(last, nn.Linear):  # start the components apart, so that they do not learn the same thing
+            with torch.no_grad():
+                last.bias[PLACE + components : PLACE + 3 * components : 2] = torch.linspace(-0.8, 0.8, components)
+
+    def forward(self, block: Tensor) -> ActionDistribution:
+        """ActionDistribution of own blocks (n, fields): logits (n, 1, 2 + components), places (n, 1, components, 2) in the arm's frame."""
+        blocks, sign = self.canonicalize(block.unsqueeze(-2))
+        out = self.net(self.features(blocks))
+        components, split = self.components, PLACE + self.components
+        mean = out[..., split : split + 2 * components].unflatten(-1, (components, 2))
+        log_std = out[..., split + 2 * components :].unflatten(-1, (components, 2)).clamp(*LOG_STD_RANGE)
+        alpha_sign = sign[..., None, None].expand(*mean.shape[:-1], 1)
+        return ActionDistribution(out[..., :split], mean * torch.cat([alpha_sign, torch.ones_like(alpha_sign)], -1), log_std)
+
+
+class TurnCritic(AfterstateCritic):
+    """Twin values of an arm's branches. As kinematics says where an arm puts the object, placing is judged by what follows, and a pass as a
+    placement that leaves the object where it is and is marked as such.
+
+    Args:
+        place_hidden: widths for placing and passing.
+        final_hidden: widths for finishing.
+        canonical: fold the symmetry M_x.
+        harmonics: see :class:`~marl_handover.learning.networks.AngleFeatures`.
+        seen: 1: it knows what its arm knows; 2: it sees the blocks of both arms, the acting one's first.
+    """
+
+    def __init__(self, place_hidden: Sequence[int], final_hidden: Sequence[int], canonical: bool, harmonics: int, seen: int) -> None:
+        super().__init__(place_hidden, final_hidden, canonical, harmonics)
+        self.seen = seen
+        self.place = TwinMLP(seen * self.features.width + 1, place_hidden)
+
+    def value_place(self, following: Tensor, passed: Tensor | None = None) -> Tensor:
+        """Values (2, ...) of afterstates (..., 2, fields): the acting arm's block, then the other's; ``passed`` (...) marks passes."""
+        blocks, _ = self.canonicalize(following[..., : self.seen, :])
+        features = self.features(blocks).flatten(-2)
+        mark = torch.zeros_like(features[..., 0]) if passed is None else passed.to(features.dtype)
+        return self.place(torch.cat([features, mark[..., None]], -1).flatten(0, -2)).unflatten(-1, following.shape[:-2])
+
+
+def turn_action(logits: Tensor, place: Tensor, noise: Tensor | None = None) -> Tensor:
+    """Actions (n, 3) of the branch with the largest logit, after adding ``noise`` to the logits.
+
+    ``logits`` (n, 1, 2 + components); ``place`` (n, 1, components, 2).
+    """
+    flat = logits.flatten(1) if noise is None else logits.flatten(1) + noise
+    branch = flat.argmax(-1)
+    rows = torch.arange(len(logits), device=logits.device)
+    where = place[rows, 0, (branch - PLACE).clamp_min(0)]
+    choice = torch.where(branch == FINISH, 1.0, torch.where(branch == PASS, -1.0, 0.0))
+    return torch.cat([choice[:, None], where], -1)
+
 
 REACHES = ARM_FIELDS.index("reaches_object")
 OWN = len(ARM_FIELDS)
@@ -33,12 +124,15 @@ OWN = len(ARM_FIELDS)
 
 
 class BranchValues(NamedTuple):
-    """Of each branch (n, 2 + modes): log-probability and value, a place's with its entropy; and ``place_log_prob`` (n, modes), ``mean``."""
+    """Of each branch (n, 2 + components): log-probability and value, a place's with its entropy.
+
+    And ``place_log_prob`` (n, components), ``mean``.
+    """
 
     log_probability: Tensor
     value: Tensor
     place_log_prob: Tensor
-    mean: Tensor  # (n, 1, modes, 2), of places, in (-1, 1)
+    mean: Tensor  # (n, 1, components, 2), of places, in (-1, 1)
 
 
 class TurnSacLoss(HybridSacLoss):
@@ -79,7 +173,10 @@ class TurnSacLoss(HybridSacLoss):
         return BranchValues(branches.logits[:, 0].log_softmax(-1), value, place_log_prob[:, 0], branches.mean.tanh())
 
     def soft_value(self, critic: TurnCritic, batch: dict[str, Tensor], noise: Tensor) -> SoftValue:  # type: ignore[override]
-        """Soft value of the present policy on its turn; ``probability`` (n, 2 + modes) and ``place_log_prob`` (n, modes) have no arms."""
+        """Soft value of the present policy on its turn.
+
+        ``probability`` (n, 2 + components) and ``place_log_prob`` (n, components) have no arms.
+        """
         log_probability, value, place_log_prob, mean = self.branch_values(critic, batch, noise)
         probability = log_probability.exp()
         branch_entropy = -(probability * log_probability).sum(-1)
@@ -120,7 +217,7 @@ class TurnSacLoss(HybridSacLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """``loss_qvalue`` and ``loss_actor`` of a batch of :class:`TurnReplay`, TorchRL style; training uses the parts above."""
         batch, following = self.unpacked(tensordict)
-        noise = torch.randn(2, len(tensordict), 1, self.actor.modes, 2, device=tensordict.device)
+        noise = torch.randn(2, len(tensordict), 1, self.actor.components, 2, device=tensordict.device)
         none = torch.zeros(0, 1, 0, 2, device=tensordict.device)
         critic = self.critic_loss(batch, following, noise[0])
         actor, branch, place = self.actor_loss(batch, noise[1], none, none)
@@ -183,7 +280,7 @@ class DecentralisedSac(HybridSac):
 
     def _learner(self, rules: TurnRules) -> TurnSacLoss:
         own, seen = self.config, 2 if self.learners == "ctde" else 1
-        actor = TurnActor(own.actor_hidden, own.modes, own.canonical, own.harmonics)
+        actor = TurnActor(own.actor_hidden, own.mixture_components, own.canonical, own.harmonics)
         critic, target = (TurnCritic(own.critic_hidden, own.final_hidden, own.canonical, own.harmonics, seen) for _ in range(2))
         target.load_state_dict(critic.state_dict())
         return TurnSacLoss(rules, actor, critic, target.requires_grad_(False), own)
@@ -210,12 +307,12 @@ class DecentralisedSac(HybridSac):
             "temperature_optimizer": self.temperature_optimizer,
         }
 
-    def _branches(self, actors: nn.Module, observation: Tensor) -> Branches:
+    def _branches(self, actors: nn.Module, observation: Tensor) -> ActionDistribution:
         """What the arms whose turn it is say, by ``actors``, of :func:`~marl_handover.envs.decentralised.own_view` (n, VIEW_SIZE)."""
         said = [actor(observation[:, :OWN]) for actor in actors.children()]
         right = observation[:, OWN] > 0
         left, other = said[0], said[-1]
-        return Branches(*(torch.where(right.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(left, other, strict=True)))
+        return ActionDistribution(*(torch.where(right.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(left, other, strict=True)))
 
     @torch.no_grad()
     def explore(self, observation: Tensor) -> Tensor:
@@ -225,16 +322,16 @@ class DecentralisedSac(HybridSac):
         """
         branches = self._branches(self.actors, observation)
         # Some cells follow the deterministic policy: where that goes in circles, its states must get into the memory.
-        curious = torch.arange(len(observation), device=self.device) >= int(self.config.greedy_share * len(observation))
+        exploring = torch.arange(len(observation), device=self.device) >= int(self.config.deterministic_env_fraction * len(observation))
         needed = (observation[:, REACHES] > 0) & (observation[:, OWN + 1] > 0)
         branches.logits[:, 0, PASS] -= torch.where(needed, torch.inf, 0.0)
-        place, _ = squashed_sample(branches, self._noise(branches.mean.shape) * curious[:, None, None, None])
+        place, _ = squashed_sample(branches, self._noise(branches.mean.shape) * exploring[:, None, None, None])
         uniform = torch.rand(branches.logits.flatten(1).shape, generator=self.generator, device=self.device)
         gumbel = -(-uniform.clamp_min(1e-20).log()).log()
-        blind = torch.rand(place.shape[:-1], generator=self.generator, device=self.device) < self.config.random_place
-        blind &= curious[:, None, None]
-        place = torch.where(blind[..., None], self._anywhere(place.shape), place)
-        return turn_action(branches.logits, place, gumbel * curious[:, None])
+        anywhere = torch.rand(place.shape[:-1], generator=self.generator, device=self.device) < self.config.random_place
+        anywhere &= exploring[:, None, None]
+        place = torch.where(anywhere[..., None], self._anywhere(place.shape), place)
+        return turn_action(branches.logits, place, gumbel * exploring[:, None])
 
     @torch.no_grad()
     def act(self, observation: Tensor) -> Tensor:
@@ -247,7 +344,7 @@ class DecentralisedSac(HybridSac):
         stride = len(self.parts)
         rows = [loss.unpacked(batch[number::stride]) for number, (loss, _, _) in enumerate(self.parts)]
         count = len(batch) // stride
-        shape = (count, 1, self.config.modes, 2)
+        shape = (count, 1, self.config.mixture_components, 2)
         critic = [lossy(*both, self._noise(shape)) for (_, lossy, _), both in zip(self.parts, rows, strict=True)]
         critic_loss = torch.stack(critic).sum()
         stepped(self.critic_optimizer, critic_loss)
@@ -279,3 +376,50 @@ class DecentralisedSac(HybridSac):
             "temperature_place": temperature[0],
             "temperature_branch": temperature[1],
         }
+
+
+class Decentralised(Variant):
+    """Arms that take turns (see :mod:`marl_handover.envs.decentralised`) and learn as ``decentralised.learners`` says."""
+
+    algorithms: ClassVar[dict[str, type[Algorithm]]] = {"sac": DecentralisedSac}
+
+    def rules(self, cell: Cell, task: TaskConfig, config: TrainConfig) -> TurnRules:
+        """The rule book with its skin for turns."""
+        return TurnRules(cell, task, config.decentralised)
+
+    def env(self, config: TrainConfig, device: torch.device) -> DecentralisedEnv:
+        """The batch of cells to train in."""
+        return DecentralisedEnv(config.num_envs, load_cell(config.cell), config.task, device, config.seed + 1, config.decentralised)
+
+    def collector(self, env: SupervisorEnv, config: TrainConfig) -> Collector:
+        """Steps of all cells, of which only transfers count as steps."""
+        return BatchedCollector(env, max_decisions=_turn_rules(env.rules).max_decisions)
+
+    def replay(self, env: SupervisorEnv, config: TrainConfig, generator: torch.Generator) -> TurnReplay:
+        """From turn to turn, or for a centralised critic from decision to decision."""
+        learners = config.decentralised.learners
+        return TurnReplay(_turn_rules(env.rules), config.replay, env, generator, learners != "ctde", learners == "independent")
+
+    def policy(self, algorithm: Algorithm) -> Act:
+        """The deterministic policies as one supervisor, L first. Two passes in a row: no arm moves."""
+        rules = _turn_rules(algorithm.rules)
+
+        def asked(pose: Tensor, goal: Tensor, turn: Tensor) -> Tensor:
+            both = observe(rules, "relative", pose, goal, torch.full_like(turn, NO_ARM))
+            return algorithm.act(own_view(both, turn, torch.zeros_like(turn)))
+
+        def act(pose: Tensor, goal: Tensor, previous: Tensor) -> Tensor:
+            first = rules.turn_of(previous)
+            answer = asked(pose, goal, first)
+            passed = rules.passes(answer)
+            turn = torch.where(passed, 1 - first, first)
+            answer = one_where(passed, asked(pose, goal, 1 - first), answer)
+            return one_where(rules.passes(answer), torch.full_like(pose[:, :1], torch.nan), rules.supervisor_action(answer, turn))
+
+        return act
+
+
+def _turn_rules(rules: object) -> TurnRules:
+    """The rule book as what it is here."""
+    assert isinstance(rules, TurnRules)
+    return rules

@@ -14,12 +14,7 @@ from torch import Tensor
 FLAGS = ("mask", "done", "terminated", "truncated")
 
 
-def agent_turns(rollout: TensorDictBase, agent: str, index: int = 0) -> TensorDict:
-    """The transitions of ``agent`` that begin and end in ``rollout``; arguments and result as those of :class:`TurnReader`."""
-    return TurnReader(agent, index).read(rollout)
-
-
-class TurnReader:
+class TransitionReader:
     """Reads one agent's transitions out of consecutive batches of steps of the same environments.
 
     A decision begins at a step in which it is the agent's turn (its ``mask``). It ends with the first step, that one included, after which

@@ -8,16 +8,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from marl_handover.baselines.decentralised import PASS, PLACE, Decentralised
 from marl_handover.commands.train import resumed
 from marl_handover.compose import compose
 from marl_handover.config import DecentralisedConfig, TaskConfig
 from marl_handover.envs.decentralised import DecentralisedEnv
 from marl_handover.errors import InvalidSetting
-from marl_handover.learning.algorithm_settings import ALGORITHMS
-from marl_handover.learning.decentralised import Decentralised
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.learning.trainer import Trainer
-from marl_handover.learning.turn_networks import PASS, PLACE
 from marl_handover.policies import ExactPolicy
 from marl_handover.task.episode import play
 from marl_handover.task.observations import ARM_FIELDS
@@ -92,7 +90,7 @@ def test_targets_count_every_decision_once(learner_of, paper, learners):
 
 @pytest.mark.parametrize("learners", ["shared", "ctde"])
 def test_soft_value_is_the_sum_over_what_one_arm_can_choose(learner_of, paper, learners):
-    learner = learner_of(learners, "algorithm.modes=2")
+    learner = learner_of(learners, "algorithm.mixture_components=2")
     loss = learner.parts[0][0]
     state, _ = loss.unpacked(made_up(paper, 12, learners))
     noise = torch.randn(12, 1, 2, 2, generator=torch.Generator().manual_seed(3))
@@ -221,7 +219,7 @@ def test_episodes_in_which_both_pass_time_out_and_have_used_up_their_time(learne
     assert (episodes.outcome == int(Outcome.TIMEOUT)).all()
     assert (episodes.transfers == learner.rules.config.max_steps).all()
     assert torch.equal(episodes.pose, problems[0])
-    assert learner.parts[0][0].actor.modes == 1
+    assert learner.parts[0][0].actor.components == 1
     assert PLACE == PASS + 1
 
 
@@ -282,7 +280,7 @@ def test_a_resumed_run_is_the_uninterrupted_run(small, table, tmp_path, learners
 @pytest.mark.slow
 def test_arms_without_a_supervisor_learn_to_work_together(small, tmp_path):
     stage = "curriculum=[{epsilon_low_deg:15,epsilon_high_deg:15}]"
-    pace = ("learning_starts=500", "steps_per_update=8", "batch_size=96", "actor_hidden=[64,64]", "critic_hidden=[64,64]")
+    pace = ("learning_starts=500", "env_steps_per_gradient_step=8", "batch_size=96", "actor_hidden=[64,64]", "critic_hidden=[64,64]")
     own = (f"algorithm.{setting}" for setting in pace)
     watch = ("num_envs=32", "steps=8192", "evaluation_episodes=300", "evaluation_interval=100000", "task.epsilon_deg=15", stage)
     config = small("sac", "variant=decentralised", "decentralised.learners=shared", *own, *watch)
@@ -293,7 +291,7 @@ def test_only_transfers_count_as_steps(small, tmp_path):
     trainer = Trainer(small("sac", "variant=decentralised"), tmp_path)
     decided = moved = 0
     for _ in range(20):
-        collected = trainer.experience.collect(trainer.algorithm.blind)
+        collected = trainer.collector.collect(trainer.algorithm.random_action)
         executed = collected.transition["next", "executed"]
         assert torch.equal(executed[:, 0], collected.transition["action"][:, 0] >= -1 / 3)
         assert collected.steps == int(executed.sum())

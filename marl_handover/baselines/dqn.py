@@ -18,6 +18,7 @@ Hindsight, which the predecessor did not have, is a setting of the replay memory
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -26,14 +27,37 @@ from torch import Tensor, nn
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate
 
+from marl_handover.baselines.dqn_grid import finishing_potential, goal_reach, grid_actions, grid_points, seen_by_finishers
 from marl_handover.cell.symmetry import LEFT, RIGHT
-from marl_handover.learning.algorithm import Algorithm
-from marl_handover.learning.algorithm_settings import DqnConfig
-from marl_handover.learning.dqn_grid import finishing_potential, goal_reach, grid_actions, grid_points, seen_by_finishers
+from marl_handover.config import LAYOUTS, bounded, chosen
+from marl_handover.errors import InvalidSetting
+from marl_handover.learning.algorithm import Algorithm, register_algorithm
 from marl_handover.learning.networks import mlp
-from marl_handover.learning.settings import TrainConfig
+from marl_handover.learning.settings import OffPolicyConfig, TrainConfig
 from marl_handover.task.observations import observation_size
 from marl_handover.task.rules import Rules
+
+
+@dataclass
+class DqnConfig(OffPolicyConfig):
+    """Double DQN over a grid of places: the discretised predecessor, reconstructed from the paper's few words about it."""
+
+    name: str = "dqn"
+    layout: str = chosen("raw", LAYOUTS)
+    learning_rate: float = bounded(5e-4, 1e-8, 10.0)
+    hidden: list[int] = bounded([256, 256], 1, 4096, (0, 8))
+    grid_mm: float = bounded(20.0, 2.0, 200.0)  # spacing of the places
+    random_start: float = bounded(1.0, 0.0, 1.0)  # share of random decisions, falling linearly from start ...
+    random_end: float = bounded(0.05, 0.0, 1.0)
+    random_until: float = bounded(0.5, 1e-6, 1000.0)  # ... to end at this fraction of training
+    shaping: float = bounded(0.0, 0.0, 1e6)  # potential-based reward for half a turn towards an orientation an arm can finish with
+    finishing_first: int = bounded(0, 0, 10**9)  # of architecture B: gradient steps that only train when to finish, before all others
+
+    def validate(self) -> None:
+        """As the base class, and what only this algorithm has."""
+        super().validate()
+        if self.exploration != "chart":
+            raise InvalidSetting("algorithm.exploration", self.exploration, "'chart' for algorithm=dqn, whose grid is even on the table")
 
 
 class Choices(nn.Module):
@@ -48,6 +72,7 @@ class Choices(nn.Module):
         return torch.cat([self.place(observation), self.finish(observation)], -1)
 
 
+@register_algorithm(DqnConfig)
 class Dqn(Algorithm):
     """Networks, TorchRL's losses and the grid."""
 
@@ -123,7 +148,7 @@ class Dqn(Algorithm):
         """The choice with the highest value."""
         return self.actions[self.values(observation).argmax(-1)]
 
-    def blind(self, observation: Tensor) -> Tensor:
+    def random_action(self, observation: Tensor) -> Tensor:
         """Uniform choices."""
         index = torch.randint(len(self.actions), (len(observation),), generator=self.generator, device=self.device)
         return self.actions[index]
@@ -132,7 +157,7 @@ class Dqn(Algorithm):
     def explore(self, observation: Tensor) -> Tensor:
         """The best choice, or a random one."""
         random = torch.rand(len(observation), 1, generator=self.generator, device=self.device) < self.random_share
-        return torch.where(random, self.blind(observation), self.act(observation))
+        return torch.where(random, self.random_action(observation), self.act(observation))
 
     def index(self, action: Tensor, arm: Tensor, final: Tensor) -> Tensor:
         """Numbers (n,) of the choices that stored actions (n, 4) were: by the nearest place, whatever rounding did to it."""

@@ -8,12 +8,12 @@ from functools import cache
 import pytest
 import torch
 
+from marl_handover.baselines.turn_replay import TurnReplay
 from marl_handover.cell import load_cell
 from marl_handover.config import DecentralisedConfig, NoiseConfig, TaskConfig
 from marl_handover.envs.decentralised import DecentralisedEnv
 from marl_handover.learning.replay import EpisodeWriter
 from marl_handover.learning.settings import HindsightConfig, ReplayConfig
-from marl_handover.learning.turn_replay import TurnReplay
 from tests.symmetries import GROUP
 
 

@@ -12,9 +12,8 @@ from tensordict import TensorDict
 from marl_handover.compose import compose
 from marl_handover.config import NoiseConfig
 from marl_handover.envs.supervisor_env import SupervisorEnv
-from marl_handover.learning.algorithm_settings import ALGORITHMS
 from marl_handover.learning.replay import EpisodeWriter, HindsightReplayBuffer
-from marl_handover.learning.settings import HindsightConfig, ReplayConfig, TrainConfig
+from marl_handover.learning.settings import ALGORITHMS, HindsightConfig, ReplayConfig, TrainConfig
 
 SMALL = (
     "compile=off",
@@ -26,10 +25,10 @@ SMALL = (
     "checkpoint_interval=100000",
 )
 SMALL_NETWORKS = {
-    "sac": ("actor_hidden=[32,32]", "critic_hidden=[32,32]", "learning_starts=200", "batch_size=32", "steps_per_update=16"),
-    "box_sac": ("hidden=[32,32]", "learning_starts=200", "batch_size=32", "steps_per_update=16"),
-    "td3": ("hidden=[32,32]", "learning_starts=200", "batch_size=32", "steps_per_update=16"),
-    "dqn": ("hidden=[32,32]", "learning_starts=200", "batch_size=32", "steps_per_update=16"),
+    "sac": ("actor_hidden=[32,32]", "critic_hidden=[32,32]", "learning_starts=200", "batch_size=32", "env_steps_per_gradient_step=16"),
+    "flat_sac": ("hidden=[32,32]", "learning_starts=200", "batch_size=32", "env_steps_per_gradient_step=16"),
+    "td3": ("hidden=[32,32]", "learning_starts=200", "batch_size=32", "env_steps_per_gradient_step=16"),
+    "dqn": ("hidden=[32,32]", "learning_starts=200", "batch_size=32", "env_steps_per_gradient_step=16"),
     "ppo": ("hidden=[32,32]", "rollout_steps=16", "batch_size=160", "epochs=2"),
 }
 

@@ -1,0 +1,111 @@
+"""Names that can be added to: algorithms, backends, policies, observation layouts. Each is one Python file, found by its name.
+
+A file adds a name with ``register`` of the :class:`Registry` that it belongs to. Files of your own are listed in the environment
+variable ``MARL_HANDOVER_PLUGINS``, which ``plugins=`` of every command sets; worker processes inherit it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from marl_handover.errors import CorruptFile, HandoverError, MissingFile, UnknownChoice, first_line
+from marl_handover.files import expanded
+
+VARIABLE = "MARL_HANDOVER_PLUGINS"
+"""Environment variable: paths of Python files, separated as those of ``PATH`` are."""
+
+Entry = TypeVar("Entry")
+
+_loaded: set[str] = set()
+
+
+class Registry(Mapping[str, Entry]):
+    """What names stand for.
+
+    A shipped name says which module registers it, so that the module is imported when the name is used and not before.
+
+    Args:
+        what: kind of the entries, for messages.
+        modules: shipped name -> module.
+    """
+
+    def __init__(self, what: str, modules: Mapping[str, str] | None = None) -> None:
+        self.what, self._modules = what, dict(modules or {})
+        self._entries: dict[str, Entry] = {}
+
+    def register(self, name: str) -> Callable[[Entry], Entry]:
+        """A decorator that makes ``name`` stand for what it decorates."""
+
+        def add(entry: Entry) -> Entry:
+            self._entries[name] = entry
+            return entry
+
+        return add
+
+    def __getitem__(self, name: str) -> Entry:
+        if name not in self._entries:
+            load_plugins()
+            if name in self._modules:
+                importlib.import_module(self._modules[name])
+        if name not in self._entries:
+            raise UnknownChoice(self.what, name, tuple(self))
+        return self._entries[name]
+
+    def __contains__(self, name: object) -> bool:
+        load_plugins()
+        return name in self._modules or name in self._entries
+
+    def __iter__(self) -> Iterator[str]:
+        load_plugins()
+        return iter(dict.fromkeys([*self._modules, *self._entries]))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    __hash__ = object.__hash__
+
+
+def add_plugins(paths: str) -> None:
+    """Add Python files, separated by commas, to those that are loaded when a name is looked for.
+
+    Raises:
+        MissingFile, CorruptFile: there is no such file, or it cannot be imported.
+    """
+    files = [str(expanded(path.strip()).absolute()) for path in paths.strip("[]").split(",") if path.strip()]
+    os.environ[VARIABLE] = os.pathsep.join([*filter(None, os.environ.get(VARIABLE, "").split(os.pathsep)), *files])
+    load_plugins()
+
+
+def load_plugins() -> None:
+    """Import the files that :data:`VARIABLE` lists, each once in a process."""
+    listed = os.environ.get(VARIABLE, "")
+    for name in filter(None, listed.split(os.pathsep)) if listed else ():
+        if name not in _loaded:
+            _loaded.add(name)  # before it is imported: it looks names up itself
+            _import_file(Path(name))
+
+
+def _import_file(path: Path) -> None:
+    if not path.is_file():
+        raise MissingFile("plugin", path)
+    name = f"marl_handover_plugin_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise CorruptFile("plugin", path, "it is no Python file (.py)")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses and pickle look it up there
+    try:
+        spec.loader.exec_module(module)
+    except HandoverError:
+        raise
+    except Exception as error:  # whatever the file does
+        raise CorruptFile("plugin", path, f"{type(error).__name__}: {first_line(error)}") from error
