@@ -137,7 +137,8 @@ def _changed(group: str, values: Mapping[str, Any], usual: Mapping[str, Any]) ->
     """Name and value of each key that is not as usual."""
     for key, value in values.items():
         if is_dataclass(value):
-            yield from _changed(f"{group}{key}.", vars(value), vars(usual[key]))
+            section = usual[key] if is_dataclass(usual[key]) else type(value)()  # type: ignore[misc]  # a section that is usually left out
+            yield from _changed(f"{group}{key}.", vars(value), vars(section))
         elif value != usual[key]:
             yield f"{group}{key}", value
 

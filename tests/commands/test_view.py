@@ -69,6 +69,7 @@ def test_modes_that_do_not_fit_what_is_given_are_refused(settings, words):
         (["live=/nowhere", "speed=2"], "speed"),
         (["live=/nowhere", "epsilon_deg=3"], "task.epsilon_deg"),
         (["live=/nowhere", "motion.grasp_s=0.7"], "motion.grasp_s"),
+        (["live=/nowhere", "task.noise.position_mm=0.5"], "task.noise.position_mm"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, words, capsys):
