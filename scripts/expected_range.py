@@ -6,8 +6,8 @@ ROW is one of ``suite=seeds``, whose stored runs say what to expect.
 import sys
 from pathlib import Path
 
-from marl_handover.compare.tables import expected_lines
 from marl_handover.errors import HandoverError
+from marl_handover.experiments.tables import expected_lines
 from marl_handover.report.table import read_json
 
 STORED = Path(__file__).resolve().parents[1] / "bench" / "results" / "compare" / "seeds" / "results.json"

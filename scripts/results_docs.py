@@ -7,8 +7,8 @@ one that does not have all rows and seeds yet is taken, too, and the page says s
 import sys
 from pathlib import Path
 
-from marl_handover.compare.docs import filled, read_evidence, store_evidence
 from marl_handover.errors import HandoverError
+from marl_handover.experiments.tables import filled, read_evidence, store_evidence
 from marl_handover.files import write_whole
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -37,7 +37,7 @@ from marl_handover.bounds import Bounds, bounds_of
 LIMIT_S, LIMIT_MB, LONGEST = 30.0, 1500, 300
 LONG_WORK = (
     "marl_handover.learning.trainer.Trainer.run",  # after the trainer was built: networks, replay memory, environments
-    "marl_handover.compare.tune.run_trials",  # after the study was opened
+    "marl_handover.experiments.tune.run_trials",  # after the study was opened
     "marl_handover.commands.compare._run_tasks",  # after every task was composed and checked
     "marl_handover.commands.simulate.play",  # after the cell was built in PyBullet
     "marl_handover.motion.planner.MotionPlanner.warm_up",  # of closed loops and motions: after the planner was built

@@ -115,7 +115,7 @@ def _sections(hint: Any) -> Iterator[type]:
 
 def _schemas() -> dict[type, str]:
     """Every dataclass of settings that a command line reaches, with a key that leads to it."""
-    from marl_handover.compare.suite import Suite
+    from marl_handover.experiments.suite import Suite
 
     found: dict[type, str] = {}
     todo: list[tuple[type, str]] = [(Suite, "suite")]

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from marl_handover.compare.docs import NOT_RUN, blocks, filled, partial_line, read_evidence
-from marl_handover.compare.suite import load_suite, suite_folder
-from marl_handover.compare.tables import make_tables, markdown
+from marl_handover.experiments.suite import load_suite, suite_folder
+from marl_handover.experiments.tables import NOT_RUN, blocks, filled, make_tables, markdown, partial_line, read_evidence
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")

@@ -12,8 +12,8 @@ from marl_handover.config import bounded, check_bounds, chosen, path_field
 from marl_handover.errors import InvalidSetting, UnknownChoice, WorkFailed
 
 if TYPE_CHECKING:
-    from marl_handover.compare.runs import Task
-    from marl_handover.compare.suite import Suite
+    from marl_handover.experiments.runs import Task
+    from marl_handover.experiments.suite import Suite
 
 
 @dataclass
@@ -46,10 +46,9 @@ def run(config: CompareConfig) -> int:
         WorkFailed: some tasks failed; the others are done and reported.
     """
     from marl_handover.commands import evaluate, train
-    from marl_handover.compare.plan import Grammar, plan_tasks
-    from marl_handover.compare.runs import check_unchanged
-    from marl_handover.compare.statistics import require_statistics
-    from marl_handover.compare.suite import load_suite
+    from marl_handover.experiments.runs import Grammar, check_unchanged, plan_tasks
+    from marl_handover.experiments.statistics import require_statistics
+    from marl_handover.experiments.suite import load_suite
 
     require_statistics()
     check_bounds(config)
@@ -105,7 +104,7 @@ def _calibrate_twin(tasks: Sequence[Task]) -> None:
     from marl_handover.runtime.lab import is_calibrated
     from marl_handover.runtime.settings import twin_lab
 
-    configs = [judgement.config for task in tasks for judgement in task.judgements]
+    configs = [job.config for task in tasks for job in task.jobs]
     if any(config.backend == "twin" and config.calibration is None for config in configs) and not is_calibrated(twin_lab().folder()):
         print(f"calibrating the twin first, into {twin_lab().folder()}", file=sys.stderr)
         calibrate.run(calibrate.CalibrateCommand(**vars(twin_lab())))
@@ -113,8 +112,8 @@ def _calibrate_twin(tasks: Sequence[Task]) -> None:
 
 def _run_tasks(config: CompareConfig, tasks: Sequence[Task]) -> tuple[dict[str, str], list[str]]:
     """Run what is not finished; name and reason of what failed, and names of what another call is at."""
-    from marl_handover.compare.launch import Failure, fan_out
-    from marl_handover.compare.runs import clear_all, execute, finished, is_named
+    from marl_handover.experiments.executor import Failure, fan_out
+    from marl_handover.experiments.runs import clear_all, execute, finished, is_named
 
     # In the order of their seeds, so that what is there after half of the time compares all rows.
     todo = sorted((task for task in tasks if not finished(task) or is_named(task, config.overwrite)), key=lambda task: task.seed)
@@ -135,8 +134,8 @@ def _run_tasks(config: CompareConfig, tasks: Sequence[Task]) -> tuple[dict[str, 
 
 def _report(suite: Suite, whole: Suite, tasks: Sequence[Task], failures: dict[str, str], out: Path) -> dict[str, Any]:
     """Write all numbers, tables and figures; print the tables. What an earlier report left and this one does not have goes away."""
-    from marl_handover.compare.results import gather
-    from marl_handover.compare.tables import csv_text, make_tables, markdown
+    from marl_handover.experiments.results import gather
+    from marl_handover.experiments.tables import csv_text, make_tables, markdown
     from marl_handover.files import write_whole
     from marl_handover.report.compare import make_figures
     from marl_handover.report.figure_style import save_figure, write_json

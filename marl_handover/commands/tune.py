@@ -20,7 +20,7 @@ from marl_handover.wording import counted
 if TYPE_CHECKING:
     from optuna.study import Study
 
-    from marl_handover.compare.tune import Note, Search
+    from marl_handover.experiments.tune import Note, Search
 
 
 STUDY_FILE = "study.txt"
@@ -53,7 +53,7 @@ GROUPS = train.GROUPS
 
 def run(config: TuneConfig) -> int:
     """Do the trials that are left; write ``trials.csv`` and ``best.yaml``; print the best settings."""
-    from marl_handover.compare.tune import prepare, run_trials
+    from marl_handover.experiments.tune import prepare, run_trials
 
     search, out = _search(config)
     study, left = prepare(search)
@@ -74,10 +74,10 @@ def run(config: TuneConfig) -> int:
 def _search(config: TuneConfig) -> tuple[Search, Path]:
     """What to do, checked, and the folder for it."""
     from marl_handover.cell import build_cell
-    from marl_handover.compare.tune import Search
-    from marl_handover.compare.tune_space import load_space
-    from marl_handover.compare.tune_storage import located
     from marl_handover.compose import option_file
+    from marl_handover.experiments.tune import Search
+    from marl_handover.experiments.tune_space import load_space
+    from marl_handover.experiments.tune_storage import located
     from marl_handover.learning.trainer import usable_device
 
     check_bounds(config)
@@ -110,8 +110,7 @@ def _line(note: Note) -> str:
 
 def _report(search: Search, study: Study, out: Path, notes: list[Note]) -> None:
     """Write what is known of the trials, and the best of them."""
-    from marl_handover.compare.tune import require_result
-    from marl_handover.compare.tune_report import arguments, best_settings, write_preset, write_trials
+    from marl_handover.experiments.tune import arguments, best_settings, require_result, write_preset, write_trials
 
     write_trials(study, search, out / "trials.csv")
     require_result(study, notes)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from marl_handover.cli import main
-from marl_handover.compare import runs
+from marl_handover.experiments import runs
 from marl_handover.locks import held
 
 SUITE = """

@@ -16,8 +16,8 @@ import yaml
 from marl_handover.cli import main
 from marl_handover.commands import train
 from marl_handover.commands.tune import SCHEMA
-from marl_handover.compare.tune_report import OF_THE_RUN
 from marl_handover.compose import compose, from_yaml
+from marl_handover.experiments.tune import OF_THE_RUN
 from marl_handover.learning.settings import TrainConfig
 
 SPACE = """

@@ -15,12 +15,23 @@ import pytest
 
 from marl_handover.cell import load_cell
 from marl_handover.commands import evaluate, train
-from marl_handover.compare import runs
-from marl_handover.compare.plan import Grammar, plan_tasks
-from marl_handover.compare.records import commits_of, fingerprint, read_record, settings_of, usual_settings
-from marl_handover.compare.runs import Busy, ChangedRow, IncompleteTask, Task, check_unchanged, clear, clear_all, execute, finished
-from marl_handover.compare.suite import load_suite
 from marl_handover.config import TaskConfig
+from marl_handover.experiments import runs
+from marl_handover.experiments.provenance import commits_of, fingerprint, read_record, settings_of, usual_settings
+from marl_handover.experiments.runs import (
+    Busy,
+    ChangedRow,
+    Grammar,
+    IncompleteTask,
+    Task,
+    check_unchanged,
+    clear,
+    clear_all,
+    execute,
+    finished,
+    plan_tasks,
+)
+from marl_handover.experiments.suite import load_suite
 from marl_handover.learning import trainer
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.learning.settings import TrainConfig

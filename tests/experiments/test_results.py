@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from marl_handover.compare.results import _sooner
-from marl_handover.compare.tables import csv_text, expected_lines, make_tables, markdown
 from marl_handover.errors import UnknownChoice
+from marl_handover.experiments.results import _sooner
+from marl_handover.experiments.tables import csv_text, expected_lines, make_tables, markdown
 
 
 def row(budget: int, *reached: int | None):

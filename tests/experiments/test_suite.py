@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from marl_handover.commands import evaluate, train
-from marl_handover.compare.plan import BadRow, Grammar, plan_tasks
-from marl_handover.compare.suite import Suite, load_suite, suite_folder
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, UnknownChoice
+from marl_handover.experiments.runs import BadRow, Grammar, plan_tasks
+from marl_handover.experiments.suite import Suite, load_suite, suite_folder
 
 TRAIN, EVALUATE = Grammar(train.ALIASES, train.GROUPS), Grammar(evaluate.ALIASES, evaluate.GROUPS)
 SHIPPED = sorted(path.stem for path in suite_folder().glob("*.yaml"))
@@ -53,7 +53,7 @@ def test_every_shipped_row_composes(name, size):
         try:
             tasks = plan_tasks(suite.with_rows([row.name]), Path("out"), TRAIN, EVALUATE)
             assert [task.seed for task in tasks] == list(suite.seeds_of(row))
-            assert tasks[0].judgements
+            assert tasks[0].jobs
         except BadRow as error:
             refused.append(str(error))
     assert not refused
@@ -84,15 +84,15 @@ def test_tasks_are_rows_by_seeds_with_arguments_from_weak_to_strong(suite):
     assert (first.train.steps, first.train.task.architecture, first.train.seed) == (1000, "A", 0)
     home = Path("out").absolute()  # workers may stand elsewhere
     assert first.train.out == str(home / "a/seed0/run")
-    assert [(j.name, j.config.policy, j.config.seed, j.config.episodes) for j in first.judgements] == [
+    assert [(j.name, j.config.policy, j.config.seed, j.config.episodes) for j in first.jobs] == [
         ("kinematic", f"{home}/a/seed0/run", 100, 10),
         ("shielded", f"shielded:{home}/a/seed0/run", 100, 1000),
         ("chosen", f"{home}/a/seed0/run", 100, 1000),
     ]
-    assert [j.name for j in tasks[1].judgements] == ["kinematic", "chosen"]
+    assert [j.name for j in tasks[1].jobs] == ["kinematic", "chosen"]
     untrained = tasks[-1]
     assert untrained.train is None
-    assert [(j.name, j.config.policy, j.config.task.architecture, j.config.seed) for j in untrained.judgements] == [
+    assert [(j.name, j.config.policy, j.config.task.architecture, j.config.seed) for j in untrained.jobs] == [
         ("kinematic", "exact", "A", 102)
     ]
 
@@ -102,7 +102,7 @@ def test_the_smoke_size_has_the_last_word(suite):
     assert [task.name for task in tasks] == ["a/seed0", "b/seed0", "exact/seed0"]
     assert tasks[0].train is not None
     assert tasks[0].train.steps == 50
-    assert tasks[0].judgements[0].config.episodes == 2
+    assert tasks[0].jobs[0].config.episodes == 2
     assert suite.sized("full") == suite
 
 
@@ -219,7 +219,7 @@ def test_bad_evaluation_settings_too(tmp_path):
 def test_policies_that_are_paths_are_found_from_everywhere(tmp_path):
     rows = "{name: mine, policy: 'shielded:runs/x'}\n  - {name: b, policy: greedy}"
     suite = load_suite(written(tmp_path, MINIMAL.replace("{name: b, train: []}", rows)))
-    policies = {task.row: task.judgements[0].config.policy for task in plan_tasks(suite, Path("out"), TRAIN, EVALUATE)}
+    policies = {task.row: task.jobs[0].config.policy for task in plan_tasks(suite, Path("out"), TRAIN, EVALUATE)}
     assert policies["mine"] == f"shielded:{Path('runs/x').absolute()}"
     assert (policies["b"], policies["exact"]) == ("greedy", "exact")
 

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.compare import statistics
-from marl_handover.compare.records import REPORT_KEYS, TRAINED_KEYS, commits_of, fingerprint, read_record, settings_of
-from marl_handover.compare.runs import RUN_FOLDER, TRAINED, Task
-from marl_handover.compare.suite import RowSpec, Suite
-from marl_handover.compare.suite_check import BAR_MEASURES, REPORTED
 from marl_handover.errors import HandoverError
+from marl_handover.experiments import statistics
+from marl_handover.experiments.provenance import REPORT_KEYS, TRAINED_KEYS, commits_of, fingerprint, read_record, settings_of
+from marl_handover.experiments.runs import RUN_FOLDER, TRAINED, Task
+from marl_handover.experiments.suite import BAR_MEASURES, REPORTED, RowSpec, Suite
 from marl_handover.report.metrics import Metrics, common_curve, read_metrics
 from marl_handover.task.rules import Outcome
 
@@ -101,11 +100,11 @@ def _run(task: Task, suite: Suite) -> Tree:
     """One task's numbers; what is not there yet is left out."""
     trained = None if task.train is None else read_record(task.folder / TRAINED, TRAINED_KEYS)
     evaluations = {}
-    for judgement in task.judgements:
-        report = read_record(task.folder / f"{judgement.name}.json", REPORT_KEYS)
+    for job in task.jobs:
+        report = read_record(task.folder / f"{job.name}.json", REPORT_KEYS)
         if report is not None:
             about = report.pop("provenance")
-            evaluations[judgement.name] = {**report, "policy": about["policy"], "commit": about["commit"], "machine": about["machine"]}
+            evaluations[job.name] = {**report, "policy": about["policy"], "commit": about["commit"], "machine": about["machine"]}
     run: Tree = {"seed": task.seed, "trained": trained, "evaluations": evaluations}
     if trained is not None:
         metrics = read_metrics(task.folder / RUN_FOLDER)
@@ -119,7 +118,7 @@ def _measures(suite: Suite) -> list[str]:
 
 
 def _unfinished(task: Task, run: Tree) -> bool:
-    return (task.train is not None and run["trained"] is None) or len(run["evaluations"]) < len(task.judgements)
+    return (task.train is not None and run["trained"] is None) or len(run["evaluations"]) < len(task.jobs)
 
 
 def _row(suite: Suite, row: RowSpec, tasks: Sequence[Task], runs: list[Tree]) -> Tree:

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rliable import library, metrics
 
-from marl_handover.compare import statistics
-from marl_handover.compare.statistics import band_of, first_reaching, improvement, mean, milestone, profile, true_coverage
 from marl_handover.errors import HandoverError
+from marl_handover.experiments import statistics
+from marl_handover.experiments.statistics import band_of, first_reaching, improvement, mean, milestone, profile, true_coverage
 
 SCORES = np.array([[0.2], [0.9], [0.6], [0.7], [0.65]])
 

@@ -1,10 +1,4 @@
-"""The runs of a suite: what each of them is, doing one, and knowing which are done.
-
-A task is one seed of one row. Its folder ``<out>/<row>/seed<k>`` holds ``task.json`` (what was asked), the run directory ``run``,
-``trained.json``, one ``<evaluation>.json`` each, and at last ``done.json``. Whatever of these is there is not made again, so a suite
-that was interrupted goes on where it stopped, and a damaged record is made again. A task whose settings have changed since is refused by
-name. Only one call at a time works at a task: ``seed<k>.lock`` beside its folder is locked meanwhile.
-"""
+"""Every task of a suite: planned and checked before anything runs, then trained, judged and written down, each part once."""
 
 from __future__ import annotations
 
@@ -12,21 +6,26 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
-from marl_handover.compare import records, suite_check
-from marl_handover.compare.records import fingerprint, read_record, settings_of, write_record
-from marl_handover.errors import HandoverError, WorkFailed
+from marl_handover.compose import Groups, compose
+from marl_handover.errors import HandoverError, InvalidSetting, UnknownChoice, WorkFailed
+from marl_handover.experiments import provenance
+from marl_handover.experiments.provenance import fingerprint, read_record, settings_of, write_record
+from marl_handover.experiments.suite import EVALUATION_SEED_OFFSET, RECORDS, RUN, RowSpec, Suite
 from marl_handover.files import expanded
 from marl_handover.learning.recorder import machine
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.locks import held
+from marl_handover.policies.registry import NAMES
+from marl_handover.policies.shielded import SHIELDED
 from marl_handover.runtime.assessment import AssessmentConfig
 from marl_handover.runtime.settings import twin_lab
 
-ASKED, TRAINED, DONE = (f"{name}.json" for name in suite_check.RECORDS)
+ASKED, TRAINED, DONE = (f"{name}.json" for name in RECORDS)
 RUN_FOLDER = "run"
 
 GRACE_S = 20.0
@@ -34,7 +33,7 @@ GRACE_S = 20.0
 
 
 @dataclass(frozen=True)
-class Judgement:
+class EvaluationJob:
     """One evaluation of a task. ``policy`` is as the suite has it, with ``{run}`` for the run directory; ``base`` is where paths start."""
 
     name: str
@@ -50,8 +49,8 @@ class Judgement:
         return replace(self.config, problems=problems, calibration=folder and str(self.base / expanded(folder)))
 
     def contents(self) -> dict[str, str]:
-        """Hashes of the files that it reads, see :func:`marl_handover.compare.records.contents_of`."""
-        return records.contents_of(self.placed(), own_run=suite_check.RUN in self.policy)
+        """Hashes of the files that it reads, see :func:`marl_handover.experiments.provenance.contents_of`."""
+        return provenance.contents_of(self.placed(), own_run=RUN in self.policy)
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class Task:
     folder: Path
     train: TrainConfig | None
     arguments: tuple[str, ...]
-    judgements: tuple[Judgement, ...]
+    jobs: tuple[EvaluationJob, ...]
     commit: str
 
     @property
@@ -107,39 +106,39 @@ def check_unchanged(task: Task, overwrite: Sequence[str] = ()) -> None:
         return
     if task.train is not None:
         _compare_training(task, task.train)
-    for judgement in task.judgements:
-        name = f"{task.row}/{judgement.name}"
-        path = task.folder / f"{judgement.name}.json"
-        report = None if name in overwrite else read_record(path, records.REPORT_KEYS)
+    for job in task.jobs:
+        name = f"{task.row}/{job.name}"
+        path = task.folder / f"{job.name}.json"
+        report = None if name in overwrite else read_record(path, provenance.REPORT_KEYS)
         if report is not None:
             about = report["provenance"]
-            if about["policy"] != judgement.policy:
-                raise ChangedRow(path, f"evaluation {name}", "policy", about["policy"], judgement.policy, name)
-            _compare(path, about["settings"], judgement.config, f"evaluation {name}", name)
-            stored, now = about.get("contents", {}), judgement.contents()
+            if about["policy"] != job.policy:
+                raise ChangedRow(path, f"evaluation {name}", "policy", about["policy"], job.policy, name)
+            _compare(path, about["settings"], job.config, f"evaluation {name}", name)
+            stored, now = about.get("contents", {}), job.contents()
             for key in sorted(stored.keys() & now.keys()):
                 if stored[key] != now[key]:
                     raise ChangedRow(path, f"evaluation {name}", f"content of {key}", stored[key], now[key], name)
 
 
 def _compare_training(task: Task, config: TrainConfig) -> None:
-    asked = read_record(task.folder / ASKED, records.ASKED_KEYS)
+    asked = read_record(task.folder / ASKED, provenance.ASKED_KEYS)
     if asked is not None:
         _compare(task.folder / ASKED, asked["settings"], config, f"row {task.row}", task.row)
-    elif trained := read_record(task.folder / TRAINED, records.TRAINED_KEYS):
+    elif trained := read_record(task.folder / TRAINED, provenance.TRAINED_KEYS):
         now = fingerprint(settings_of(config))
         if trained["config_hash"] != now:
             raise ChangedRow(task.folder / TRAINED, f"row {task.row}", "config_hash", trained["config_hash"], now, task.row)
 
 
-def _compare(path: Path, stored: records.Settings, config: TrainConfig | AssessmentConfig, what: str, overwrite: str) -> None:
-    for key, before, now in records.differences(stored, config):
+def _compare(path: Path, stored: provenance.Settings, config: TrainConfig | AssessmentConfig, what: str, overwrite: str) -> None:
+    for key, before, now in provenance.differences(stored, config):
         raise ChangedRow(path, what, key, before, now, overwrite)
 
 
 def is_named(task: Task, overwrite: Sequence[str]) -> bool:
     """Whether ``overwrite`` names the task's row, or one of its evaluations."""
-    return task.row in overwrite or any(f"{task.row}/{judgement.name}" in overwrite for judgement in task.judgements)
+    return task.row in overwrite or any(f"{task.row}/{job.name}" in overwrite for job in task.jobs)
 
 
 def clear_all(tasks: Sequence[Task], overwrite: Sequence[str]) -> None:
@@ -157,17 +156,17 @@ def clear(task: Task, overwrite: Sequence[str]) -> None:
     """Throw away what ``overwrite`` names: a row with all it has, or one ``row/evaluation``."""
     if task.row in overwrite:
         shutil.rmtree(task.folder, ignore_errors=True)
-    for judgement in task.judgements:
-        if f"{task.row}/{judgement.name}" in overwrite:
-            (task.folder / f"{judgement.name}.json").unlink(missing_ok=True)
+    for job in task.jobs:
+        if f"{task.row}/{job.name}" in overwrite:
+            (task.folder / f"{job.name}.json").unlink(missing_ok=True)
             (task.folder / DONE).unlink(missing_ok=True)
 
 
 def finished(task: Task) -> bool:
     """Whether nothing is left to do: every record is there and can be read."""
-    needed = {f"{judgement.name}.json": records.REPORT_KEYS for judgement in task.judgements} | {DONE: records.DONE_KEYS}
+    needed = {f"{job.name}.json": provenance.REPORT_KEYS for job in task.jobs} | {DONE: provenance.DONE_KEYS}
     if task.train is not None:
-        needed[TRAINED] = records.TRAINED_KEYS
+        needed[TRAINED] = provenance.TRAINED_KEYS
     return all(read_record(task.folder / name, keys) is not None for name, keys in needed.items())
 
 
@@ -189,15 +188,15 @@ def execute(task: Task) -> bool:
 def _do(task: Task) -> None:
     task.folder.mkdir(parents=True, exist_ok=True)
     here = {"commit": task.commit, "machine": machine()}
-    if task.train is not None and read_record(task.folder / TRAINED, records.TRAINED_KEYS) is None:
+    if task.train is not None and read_record(task.folder / TRAINED, provenance.TRAINED_KEYS) is None:
         _train(task, task.train, here)
     failed = []
-    for judgement in task.judgements:
-        if read_record(task.folder / f"{judgement.name}.json", records.REPORT_KEYS) is None:
+    for job in task.jobs:
+        if read_record(task.folder / f"{job.name}.json", provenance.REPORT_KEYS) is None:
             try:
-                _judge(task, judgement, here)
+                _judge(task, job, here)
             except Exception as error:  # whatever it is, the other evaluations go on
-                failed.append(f"{judgement.name}: {type(error).__name__}: {' '.join(str(error).split())}")
+                failed.append(f"{job.name}: {type(error).__name__}: {' '.join(str(error).split())}")
     if failed:
         raise IncompleteTask("; ".join(failed))
     write_record(task.folder / DONE, _summary(task, here))
@@ -210,11 +209,11 @@ def _train(task: Task, config: TrainConfig, here: Mapping[str, Any]) -> None:
 
     settings = settings_of(config)
     folder = task.folder / RUN_FOLDER
-    before = read_record(task.folder / ASKED, records.ASKED_KEYS)
+    before = read_record(task.folder / ASKED, provenance.ASKED_KEYS)
     if before is None:
         # Nobody knows what a run without its record was asked.
         shutil.rmtree(folder, ignore_errors=True)
-    commits = list(dict.fromkeys([*(records.commits_of(before) if before else []), task.commit]))
+    commits = list(dict.fromkeys([*(provenance.commits_of(before) if before else []), task.commit]))
     asked = {"row": task.row, "seed": task.seed, "arguments": list(task.arguments), "config_hash": fingerprint(settings)}
     asked |= {**here, "commits": commits}
     write_record(task.folder / ASKED, {**asked, "settings": settings})
@@ -226,21 +225,21 @@ def _train(task: Task, config: TrainConfig, here: Mapping[str, Any]) -> None:
     write_record(task.folder / TRAINED, {**asked, **kept})
 
 
-def _judge(task: Task, judgement: Judgement, here: Mapping[str, Any]) -> None:
+def _judge(task: Task, job: EvaluationJob, here: Mapping[str, Any]) -> None:
     from marl_handover.runtime.assessment import assess
 
-    settings = settings_of(judgement.config)
-    contents = judgement.contents()
-    report = assess(judgement.placed()).report
-    if report.pop("calibration", None) and judgement.config.calibration:
-        report["calibration"] = judgement.config.calibration  # as asked for, not where it is on this machine
-    about = {"policy": judgement.policy, "arguments": list(judgement.arguments), "config_hash": fingerprint(settings), "settings": settings}
-    write_record(task.folder / f"{judgement.name}.json", {**report, "provenance": {**about, "contents": contents, **here}})
+    settings = settings_of(job.config)
+    contents = job.contents()
+    report = assess(job.placed()).report
+    if report.pop("calibration", None) and job.config.calibration:
+        report["calibration"] = job.config.calibration  # as asked for, not where it is on this machine
+    about = {"policy": job.policy, "arguments": list(job.arguments), "config_hash": fingerprint(settings), "settings": settings}
+    write_record(task.folder / f"{job.name}.json", {**report, "provenance": {**about, "contents": contents, **here}})
 
 
 def _summary(task: Task, here: Mapping[str, Any]) -> dict[str, Any]:
     trained = None if task.train is None else read_record(task.folder / TRAINED)
-    reports = {judgement.name: read_record(task.folder / f"{judgement.name}.json") or {} for judgement in task.judgements}
+    reports = {job.name: read_record(task.folder / f"{job.name}.json") or {} for job in task.jobs}
     return {
         "row": task.row,
         "seed": task.seed,
@@ -251,3 +250,97 @@ def _summary(task: Task, here: Mapping[str, Any]) -> dict[str, Any]:
         "evaluations": {name: report["provenance"]["config_hash"] for name, report in reports.items()},
         "ended": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
+
+
+Config = TypeVar("Config", TrainConfig, AssessmentConfig)
+
+
+class Grammar(NamedTuple):
+    """What the arguments of a command may say beyond its schema: short keys, and options that are code."""
+
+    aliases: Mapping[str, str]
+    groups: Groups
+
+
+class BadRow(HandoverError):
+    """A row whose settings do not hold."""
+
+    def __init__(self, row: str, error: HandoverError) -> None:
+        super().__init__(f"row {row}: {error}")
+        self.row = row
+
+
+def plan_tasks(suite: Suite, out: Path, train: Grammar, evaluate: Grammar) -> list[Task]:
+    """Every task of the suite, row by row, with all settings composed and checked.
+
+    Args:
+        suite: what to do.
+        out: folder of all results; workers may stand in another folder, so it is made absolute, and so are policies that are paths.
+        train: what arguments of ``train`` may say.
+        evaluate: what arguments of ``evaluate`` may say.
+
+    Raises:
+        HandoverError: bad settings; the message names the row.
+    """
+    tasks: list[Task] = []
+    # Asked here and once: in a worker, later, the files may be newer than the code that it runs.
+    commit = provenance.commit()
+    for row in suite.rows:
+        try:
+            tasks += _row_tasks(suite, row, out.absolute(), train, evaluate, commit)
+        except HandoverError as error:
+            raise BadRow(row.name, error) from error
+    return tasks
+
+
+def _row_tasks(suite: Suite, row: RowSpec, out: Path, train: Grammar, evaluate: Grammar, commit: str) -> list[Task]:
+    """A row's tasks. Settings are composed once and differ in seed and place."""
+    arguments = () if row.train is None else tuple(suite.train_arguments(row))
+    config = None if row.train is None else _composed(TrainConfig, arguments, train)
+    asked = {}
+    for spec in suite.evaluations_of(row, 0):
+        wanted = tuple(suite.evaluate_arguments(row, spec))
+        judged = _composed(AssessmentConfig, wanted, evaluate)
+        _check_fits(spec.name, judged, config, suite.policy_of(row, spec))
+        asked[spec.name] = EvaluationJob(spec.name, judged, wanted, suite.policy_of(row, spec))
+    tasks = []
+    for seed in suite.seeds_of(row):
+        folder = out / row.name / f"seed{seed}"
+        run = str(folder / RUN_FOLDER)
+        jobs = []
+        for job in (asked[spec.name] for spec in suite.evaluations_of(row, seed)):
+            policy = _placed(job.policy.replace(RUN, run))
+            own = replace(deepcopy(job.config), policy=policy, seed=EVALUATION_SEED_OFFSET + seed)
+            jobs.append(replace(job, config=own))
+        placed = None if config is None else replace(deepcopy(config), seed=seed, out=run, progress=False)
+        tasks.append(Task(row.name, seed, folder, placed, arguments, tuple(jobs), commit))
+    return tasks
+
+
+def _check_fits(name: str, judged: AssessmentConfig, trained: TrainConfig | None, policy: str) -> None:
+    """Refuse what an evaluation of a trained row would find out after the training. Raises :class:`InvalidSetting`."""
+    if trained is None or RUN not in policy:
+        return
+    architecture = judged.task.architecture
+    if architecture not in (None, trained.task.architecture):
+        raise InvalidSetting(f"{name}: task.architecture", architecture, f"{trained.task.architecture}, which the row is trained for")
+    if trained.variant == "centralised" and judged.backend != "kinematic":
+        raise InvalidSetting(f"{name}: backend", judged.backend, "kinematic for variant=centralised, whose motions are its own")
+
+
+def _placed(policy: str) -> str:
+    """A policy's name, its path absolute if it is one."""
+    if policy.startswith(SHIELDED):
+        return SHIELDED + _placed(policy.removeprefix(SHIELDED))
+    if policy in NAMES:
+        return policy
+    path = expanded(policy)
+    if path.parent == Path() and path.suffix != ".npz" and not path.exists():
+        raise UnknownChoice("policy", policy, (*NAMES, f"{SHIELDED}NAME", "a run directory", "a policy file (.npz)"))
+    return str(path.absolute())
+
+
+def _composed(schema: type[Config], arguments: Sequence[str], grammar: Grammar) -> Config:
+    config: Config = compose(schema, arguments, groups=grammar.groups, aliases=grammar.aliases)
+    config.validate()
+    return config

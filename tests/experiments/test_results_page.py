@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from marl_handover.cli import main
-from marl_handover.compare.docs import NOT_RUN, UnfitEvidence, UnknownBlock, filled, partial_line, read_evidence, store_evidence
+from marl_handover.experiments.tables import NOT_RUN, UnfitEvidence, UnknownBlock, filled, partial_line, read_evidence, store_evidence
 
 SUITE = """
 seeds: 2

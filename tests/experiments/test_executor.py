@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from marl_handover.compare.launch import LAUNCHERS, Failure, fan_out
 from marl_handover.errors import InvalidSetting, MissingExtra, UnknownChoice
+from marl_handover.experiments.executor import LAUNCHERS, Failure, fan_out
 
 WAIT_S = 20
 
@@ -85,7 +85,7 @@ def test_an_exception_fails_its_item_only(tmp_path, jobs):
     results = play(tmp_path, ["", "raise", "leave", "unpicklable", ""], jobs=jobs)
     assert {item for item, result in results.items() if isinstance(result, Failure)} == {1, 2, 3}
     failure = results[1]
-    assert failure.error.startswith("ValueError: item 1 is not welcome (test_launch.py, line ")
+    assert failure.error.startswith("ValueError: item 1 is not welcome (test_executor.py, line ")
     assert failure.error.endswith(", in noted)")
     assert "Traceback" in failure.traceback
     assert failure.item == (tmp_path, 1, "raise")
@@ -139,8 +139,8 @@ def test_no_worker_outlives_the_process_that_started_it(tmp_path, how):
     script = f"""
     import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
     from pathlib import Path
-    from marl_handover.compare.launch import fan_out
-    from test_launch import noted
+    from marl_handover.experiments.executor import fan_out
+    from test_executor import noted
     for _ in fan_out(noted, [(Path({str(tmp_path)!r}), item, "slow") for item in range(200)], jobs=2, progress=False):
         pass
     """

@@ -12,8 +12,8 @@ import sys
 
 import pytest
 
-from marl_handover.compare.tune_storage import Journal, open_study
 from marl_handover.errors import CannotWrite, CorruptFile
+from marl_handover.experiments.tune_storage import Journal, open_study
 
 
 def tell(study, values):
@@ -73,7 +73,7 @@ def test_a_full_disk_leaves_whole_lines_and_is_told(tmp_path):
 def test_a_writer_that_is_killed_at_any_moment_leaves_a_study(tmp_path):
     path = tmp_path / "study.journal"
     code = (
-        "import sys; from marl_handover.compare.tune_storage import open_study\n"
+        "import sys; from marl_handover.experiments.tune_storage import open_study\n"
         "study = open_study(sys.argv[1], 's'); print('up', flush=True)\n"
         "while True: study.tell(study.ask(), 1.0)"
     )

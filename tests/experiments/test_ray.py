@@ -20,7 +20,7 @@ import pytest
 
 from marl_handover.cli import main
 from marl_handover.cluster import ClusterUnavailable, _root_cause
-from marl_handover.compare.launch import Failure, fan_out
+from marl_handover.experiments.executor import Failure, fan_out
 
 cluster_utils = pytest.importorskip("ray.cluster_utils", reason="ray is not installed (pip install 'marl_handover[ray]')")
 

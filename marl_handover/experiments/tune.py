@@ -6,8 +6,10 @@ the trials that are left, and those whose process was killed are started again f
 
 from __future__ import annotations
 
+import csv
+import io
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,18 +18,19 @@ from uuid import uuid4
 
 import numpy as np
 import optuna
+import yaml
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.samplers import TPESampler
 from optuna.study import Study
-from optuna.trial import Trial, TrialState
+from optuna.trial import FrozenTrial, Trial, TrialState
 
-from marl_handover.compare.launch import Failure, fan_out
-from marl_handover.compare.records import settings_of, usual_settings
-from marl_handover.compare.tune_space import Parameter, applied, value_of
-from marl_handover.compare.tune_storage import abandoned, asked, claimed, counted, ended, give_back, open_study, place_of, running
-from marl_handover.compare.workers import summary
 from marl_handover.config import MAX_SEED
 from marl_handover.errors import HandoverError, WorkFailed
+from marl_handover.experiments.executor import Failure, fan_out, summary
+from marl_handover.experiments.provenance import settings_of, usual_settings
+from marl_handover.experiments.tune_space import Parameter, applied, value_of
+from marl_handover.experiments.tune_storage import abandoned, asked, claimed, counted, ended, give_back, open_study, place_of, running
+from marl_handover.files import write_whole
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.trainer import Trainer, validation_score
 
@@ -42,7 +45,7 @@ class Search:
 
     Attributes:
         study: its name.
-        storage: URL or path, see :func:`marl_handover.compare.tune_storage.open_storage`.
+        storage: URL or path, see :func:`marl_handover.experiments.tune_storage.open_storage`.
         train: the settings that are searched from.
         space: what is changed.
         origin: the file that the space was read from, for errors.
@@ -118,7 +121,7 @@ def _compare(search: Search, stored: dict[str, Any], about: dict[str, Any]) -> N
 
 
 def run_trials(search: Search, study: Study, left: int, **options: Any) -> Generator[Note, None, None]:
-    """Do ``left`` trials and tell how each went. ``options`` go to :func:`marl_handover.compare.launch.fan_out`."""
+    """Do ``left`` trials and tell how each went. ``options`` go to :func:`marl_handover.experiments.executor.fan_out`."""
     begun = counted(study)
     # Another call may count the same trials as left: what tells its slots from this one's is the last part.
     call = uuid4().hex
@@ -222,3 +225,71 @@ def require_result(study: Study, notes: list[Note]) -> None:
     if not study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
         reasons = [note.error for note in notes if note.error]
         raise WorkFailed(f"no trial of study {study.study_name} was completed" + (f": {reasons[0]}" if reasons else ""))
+
+
+MEASURED = ("seed", "step", "success_rate", "mean_steps", "steps_ratio", "wall_s")
+OF_THE_RUN = ("seed", "steps", "device", "threads", "compile", "evaluation_interval", "evaluation_episodes", "checkpoint_interval")
+"""Settings that say how a trial was run; a preset leaves them alone."""
+
+Settings = dict[str, Any]
+
+
+def write_trials(study: Study, search: Search, path: Path) -> None:
+    """Write one row for each trial, in their order."""
+    keys = [parameter.key for parameter in search.space]
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(["number", "state", "score", *MEASURED, *keys, "folder", "error"])
+    for trial in study.get_trials(deepcopy=False):
+        measured = [trial.user_attrs.get(name, "") for name in MEASURED]
+        values = [trial.params.get(key, "") for key in keys]
+        value = "" if trial.value is None else trial.value
+        folder = _folder(search, trial) if "seed" in trial.user_attrs else ""
+        writer.writerow([trial.number, trial.state.name, value, *measured, *values, folder, trial.user_attrs.get("error", "")])
+    write_whole(path, buffer.getvalue())
+
+
+def _folder(search: Search, trial: FrozenTrial) -> str:
+    return str(search.folder / f"{trial.number:04d}")
+
+
+def best_settings(study: Study, search: Search) -> Settings:
+    """By dotted key, what to change in the algorithm's defaults to train as the best trial did, apart from how long."""
+    found = study.best_trial.params
+    values = {parameter.key: parameter.read(found[parameter.key]) for parameter in search.space}
+    config = applied(search.train, values, search.origin)
+    usual = usual_settings(config)
+    changed = {key: value for key, value in settings_of(config).items() if value != usual.get(key) and key not in OF_THE_RUN}
+    return {"algorithm.name": config.algorithm.name, **{key: value for key, value in changed.items() if key != "algorithm.name"}}
+
+
+def write_preset(settings: Mapping[str, Any], study: Study, path: Path) -> None:
+    """Write settings as a preset file, with a line that says where they come from."""
+    tree: dict[str, Any] = {}
+    for key, value in settings.items():
+        *sections, name = key.split(".")
+        section = tree
+        for part in sections:
+            section = section.setdefault(part, {})
+        section[name] = value
+    best = study.best_trial
+    head = f"# Trial {best.number} of study {study.study_name}: score {best.value:.4f} on its validation problems.\n"
+    write_whole(path, head + yaml.safe_dump(tree, sort_keys=False))
+
+
+def arguments(settings: Mapping[str, Any]) -> list[str]:
+    """Settings as arguments of ``train``, ready for a shell."""
+    texts = ["algorithm=" + settings["algorithm.name"]] if "algorithm.name" in settings else []
+    texts += [f"{key}={_literal(value)}" for key, value in settings.items() if key != "algorithm.name"]
+    return [f"'{text}'" if any(sign in text for sign in "[]{}") else text for text in texts]
+
+
+def _literal(value: Any) -> str:
+    """A value in the grammar of arguments."""
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{_literal(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ",".join(map(_literal, value)) + "]"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return str(value)

@@ -16,11 +16,22 @@ from hypothesis import strategies as st
 from optuna.trial import TrialState, create_trial
 
 from marl_handover.commands.train import resumed
-from marl_handover.compare import tune
-from marl_handover.compare.tune import ChangedStudy, Search, prepare, run_trial, run_trials
-from marl_handover.compare.tune_space import applied, load_space, value_of
-from marl_handover.compare.tune_storage import TRIES, abandoned, claimed, counted, give_back, hidden, located, open_study, place_of, running
 from marl_handover.errors import CorruptFile, UnknownKey
+from marl_handover.experiments import tune
+from marl_handover.experiments.tune import ChangedStudy, Search, prepare, run_trial, run_trials
+from marl_handover.experiments.tune_space import applied, load_space, value_of
+from marl_handover.experiments.tune_storage import (
+    TRIES,
+    abandoned,
+    claimed,
+    counted,
+    give_back,
+    hidden,
+    located,
+    open_study,
+    place_of,
+    running,
+)
 from marl_handover.learning.settings import ALGORITHMS, OffPolicyConfig, TrainConfig
 from marl_handover.learning.trainer import validation_score
 from marl_handover.resources import resource_path
@@ -224,7 +235,7 @@ def test_settings_that_cannot_be_trained_with_fail_their_trial_only(search):
 
 DYING = """
 import os, signal, sys
-from marl_handover.compare.tune_storage import claimed, open_study
+from marl_handover.experiments.tune_storage import claimed, open_study
 study = open_study(sys.argv[1], "study")
 trial = study.ask()
 trial.suggest_float("algorithm.gamma", 0.9, 0.99)
