@@ -28,8 +28,8 @@ import numpy as np
 from common import ROOT, commit, machine, parse, table
 
 from marl_handover.cell.build import build_cell
+from marl_handover.control.interactive.cell import InteractiveCell, Snapshot
 from marl_handover.policies import load
-from marl_handover.runtime.interactive.cell import InteractiveCell, Snapshot
 
 DEFAULTS = {"changes": 300, "policies": "exact,pretrained_b", "drags": 10, "speed": 4.0, "seed": 0, "results": "bench/results"}
 LIMIT_MS = 100.0
@@ -133,12 +133,12 @@ def measure(name: str, values: dict[str, Any]) -> dict[str, Any]:
 
 def stops(cell: InteractiveCell, random: np.random.Generator, count: int = 200) -> dict[str, float]:
     """How long the quickest stop takes at random moments of motions, in simulated ms."""
-    engine, found = cell._engine, []
+    controller, found = cell._controller, []
     for _ in range(count):
         for _ in range(random.integers(20, 60)):
             seen = cell.advance(0.02)
         if seen.phase in ("approach", "retreat", *HELD):
-            found.append(1e3 * engine.programs.stop(engine.body).duration_s)
+            found.append(1e3 * controller.programs.stop(controller.world).duration_s)
         change(cell, random, goal=bool(random.random() < 0.5))
     return spread(found)
 

@@ -36,7 +36,7 @@ from marl_handover.motion.path_length_table import path_length_table
 from marl_handover.motion.path_optimizer import FoundPath, NoPath
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import load
-from marl_handover.runtime.motions import plan_motions
+from marl_handover.report.motion import plan_motions
 
 DEFAULTS = {"rows": 1000, "every": 50, "cycles": 200, "starts": True, "costs": 1000, "seed": 0, "results": "bench/results"}
 FIRST_PLAN = """

@@ -19,13 +19,13 @@ from common import parse, table
 
 from marl_handover import policies
 from marl_handover.cli import main as command_line
+from marl_handover.control.closed_loop import make_loop
+from marl_handover.control.events import Event
+from marl_handover.control.hardware_backend import HardwareBackend
+from marl_handover.control.session import Session
+from marl_handover.control.settings import twin_workcell
+from marl_handover.control.telemetry import Publisher
 from marl_handover.hardware.safety_filter import JointCommand
-from marl_handover.runtime.events import Event
-from marl_handover.runtime.hardware_backend import HardwareBackend
-from marl_handover.runtime.loop import make_loop
-from marl_handover.runtime.publishing import Publisher
-from marl_handover.runtime.session import Session
-from marl_handover.runtime.settings import twin_lab
 
 DEFAULTS = {"seconds": 30.0, "calibration": "", "folder": ""}
 PERIOD_S, POLL_S, FRAME_S = 0.06, 0.004, 1 / 30
@@ -34,19 +34,19 @@ POSES = np.array([[-60.0, 20.0, 0.7], [50.0, 25.0, 1.3]])
 
 def beat(backend: HardwareBackend, seconds: float, publishing: bool) -> dict[str, float]:
     """Lateness and work of each beat in ms, and the share of a core that the process used."""
-    driver, watcher, log = backend.lab.driver, backend.lab.watcher, backend.log
-    frame = backend.lab.camera.read()
-    seen = watcher.tracker.update(frame)
+    driver, pose_monitor, log = backend.workcell.driver, backend.workcell.pose_monitor, backend.log
+    frame = backend.workcell.camera.read()
+    seen = pose_monitor.tracker.update(frame)
     late, work = [], []
     begun, cpu, drawn_s = time.perf_counter(), time.process_time(), 0.0
     for number in range(int(seconds / PERIOD_S)):
         due = begun + number * PERIOD_S
         while (now := time.perf_counter()) < due:
             driver.latch.is_set()
-            if publishing and now - drawn_s > FRAME_S and watcher.shown is not None:
+            if publishing and now - drawn_s > FRAME_S and pose_monitor.shown is not None:
                 drawn_s = now
                 frame = frame._replace(number=frame.number + 1)
-                watcher.shown(frame, seen._replace(number=frame.number))
+                pose_monitor.shown(frame, seen._replace(number=frame.number))
             time.sleep(min(POLL_S, max(due - now, 0.0)))
         woken = time.perf_counter()
         for arm in (0, 1):
@@ -74,15 +74,15 @@ def main(arguments: list[str]) -> None:
             raise SystemExit("calibration failed")
         rows = []
         for name in ("off", "on", "off", "on"):
-            config = twin_lab()
+            config = twin_workcell()
             config.calibration, config.hardware.stop_file = calibration, f"{scratch}/stop"
             with (
                 Publisher(folder if name == "on" else "") as publisher,
                 make_loop(policies.adapted("pretrained_b"), "hardware", config=config) as loop,
             ):
                 publisher.attach(loop)
-                session = Session(loop, {"policy": "pretrained_b"}, publisher.desk)
-                session.backend.mover.ready()
+                session = Session(loop, {"policy": "pretrained_b"}, publisher.command_queue)
+                session.backend.player.ready()
                 session.log.add(Event.EPISODE, seed=0)
                 session.log.add(Event.GOAL, goal=np.array([120.0, 60.0, 1.0]))
                 measured = beat(session.backend, float(options["seconds"]), name == "on")

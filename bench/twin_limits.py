@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.control.twin import Twin
 from marl_handover.hardware.clearance import FAR_MM, alone_mm, arm_shapes, between_mm, still
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.emulator.board import FRAME_S
 from marl_handover.hardware.settings import ARMS
-from marl_handover.runtime.twin import Twin
 
 Floats = NDArray[np.float64]
 

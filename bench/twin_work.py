@@ -17,22 +17,22 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from fault_injection import FaultInjector, InjectedFault
 from twin_limits import LimitWatch
 
 from marl_handover import policies
 from marl_handover.arrays import wrap
 from marl_handover.bounds import MAX_SEED
 from marl_handover.cli import main as command_line
+from marl_handover.control.closed_loop import ClosedLoop, make_loop
+from marl_handover.control.evaluation import true_outcome, truly_solved
+from marl_handover.control.events import FAULTS, Event
+from marl_handover.control.session import GivenGoal, Session
+from marl_handover.control.settings import WorkcellConfig, twin_workcell
+from marl_handover.control.transfers import Episode
+from marl_handover.control.workcell import is_calibrated
 from marl_handover.errors import WorkFailed
 from marl_handover.learning.evaluation import random_problems
-from marl_handover.runtime.episode import Episode
-from marl_handover.runtime.evaluation import true_outcome, truly_solved
-from marl_handover.runtime.events import FAULTS, Event
-from marl_handover.runtime.lab import is_calibrated
-from marl_handover.runtime.loop import ClosedLoop, make_loop
-from marl_handover.runtime.mishaps import Mishap, Mishaps
-from marl_handover.runtime.session import GivenGoal, Session
-from marl_handover.runtime.settings import LabConfig, twin_lab
 from marl_handover.task.rules import Outcome, Rules
 
 HANG_WALL_S, HANG_VIRTUAL_S = 900.0, 600.0
@@ -60,7 +60,7 @@ class Work(NamedTuple):
 def robot_changes(seed: int, robot: int, noise: float) -> dict[str, Any]:
     """Settings of a robot: all its seeds, its camera as somebody hung it, its errors multiplied by ``noise``."""
     random = np.random.default_rng([seed, robot])
-    drawn, config = int(random.integers(2**31)) % (MAX_SEED + 1), twin_lab()
+    drawn, config = int(random.integers(2**31)) % (MAX_SEED + 1), twin_workcell()
     changes = {"hardware.emulator.seed": drawn, "twin.seed": drawn}
     changes["mount.eye_mm"] = (np.array([0.0, 0.0, 700.0]) + random.uniform(-4, 4, 3)).round(2).tolist()
     changes["mount.tilt_deg"] = random.uniform(-0.35, 0.35, 2).round(3).tolist()
@@ -76,9 +76,9 @@ def read(config: Any, name: str) -> float:
     return float(config)
 
 
-def changed(changes: dict[str, Any]) -> LabConfig:
+def changed(changes: dict[str, Any]) -> WorkcellConfig:
     """The twin as it is shipped, but for ``changes`` by their dotted names."""
-    config = twin_lab()
+    config = twin_workcell()
     for name, value in changes.items():
         *path, last = name.split(".")
         part: Any = config
@@ -88,7 +88,7 @@ def changed(changes: dict[str, Any]) -> LabConfig:
     return config
 
 
-def calibrated(folder: Path, values: dict[str, Any], robot: int) -> LabConfig:
+def calibrated(folder: Path, values: dict[str, Any], robot: int) -> WorkcellConfig:
     """The robot's settings, once `calibrate` has been run on it; its files are kept."""
     changes, kept = robot_changes(int(values["seed"]), robot, float(values["noise"])), folder / "calibration"
     changes["hardware.stop_file"] = str(folder / "stop")
@@ -105,14 +105,14 @@ def calibrated(folder: Path, values: dict[str, Any], robot: int) -> LabConfig:
 class Stage:
     """An open twin with a policy at work, and all that measures it."""
 
-    def __init__(self, config: LabConfig, policy: str, seed: int) -> None:
+    def __init__(self, config: WorkcellConfig, policy: str, seed: int) -> None:
         self.loop: ClosedLoop = make_loop(policies.adapted(policy), "hardware", config=config)
         self.session = Session(self.loop, {"policy": policy})
-        lab = self.session.backend.lab
-        assert lab.twin is not None
-        self.twin = lab.twin
-        self.limits = LimitWatch(self.twin, lab.driver)
-        self.mishaps = Mishaps(self.twin, self.loop.rules, seed)
+        workcell = self.session.backend.workcell
+        assert workcell.twin is not None
+        self.twin = workcell.twin
+        self.limits = LimitWatch(self.twin, workcell.driver)
+        self.mishaps = FaultInjector(self.twin, self.loop.rules, seed)
         self.latencies_ms: list[float] = []
         self._asked_s, self._drawing_s = -1.0, 0.0
         self.session.log.show(self._note)
@@ -224,20 +224,20 @@ def one(stage: Stage, part: str, number: int, count: int, seed: int) -> dict[str
     return row if mishap is None else row | about(mishap)
 
 
-def about(mishap: Mishap) -> dict[str, Any]:
+def about(mishap: InjectedFault) -> dict[str, Any]:
     """Of a mishap: its kind, whether it happened in the episode, and left its sign in the log."""
     return {"kind": mishap.kind, "happened": mishap.happened, "felt": mishap.felt, "noted": sorted(str(event) for event in mishap.noted)}
 
 
 def errors(episode: Episode, rules: Rules) -> dict[str, Any]:
     """In mm and deg: of every transfer that was carried out, against exact arms; of the first final placement, against the goal."""
-    carried = [transfer for transfer in episode.transfers if transfer.done.refusal is None]
-    off = [away(transfer.done.true, transfer.order.predicted) for transfer in carried]
+    carried = [transfer for transfer in episode.transfers if transfer.result.refusal is None]
+    off = [away(transfer.result.true, transfer.command.predicted) for transfer in carried]
     last = episode.first[-1]
     final = None
-    if last.order.final and last.done.refusal is None:
-        turned = float(np.degrees(np.abs(rules.orientation_error(last.done.true[2], last.goal[2]))))
-        final = (away(last.done.true, last.goal)[0], round(turned, 3))
+    if last.command.final and last.result.refusal is None:
+        turned = float(np.degrees(np.abs(rules.orientation_error(last.result.true[2], last.goal[2]))))
+        final = (away(last.result.true, last.goal)[0], round(turned, 3))
     return {"transfer_off": off, "final_off": final}
 
 
@@ -246,7 +246,7 @@ def away(one: Any, other: Any) -> tuple[float, float]:
     return round(float(np.hypot(*(one[:2] - other[:2]))), 3), round(abs(float(np.degrees(wrap(one[2] - other[2])))), 3)
 
 
-def soak(config: LabConfig, values: dict[str, Any], path: Path, transfers: int) -> None:
+def soak(config: WorkcellConfig, values: dict[str, Any], path: Path, transfers: int) -> None:
     """Episodes until so many transfers are done, a line for every :data:`SOAK_EVERY`; memory starts anew with each process."""
     done = rows(path)
     count, spent = sum(row["episodes"] for row in done), sum(row["transfers"] for row in done)

@@ -39,8 +39,8 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from marl_handover import cli
 from marl_handover.cell import cell_config, load_cell
+from marl_handover.control.telemetry_reader import FORMAT, STATE_FILE, VERSION
 from marl_handover.files import write_whole
-from marl_handover.runtime.feed import FORMAT, STATE_FILE, VERSION
 from marl_handover.viewer.words import flat
 
 DEFAULTS = {

@@ -263,7 +263,7 @@ def prepared(folder: Path) -> Iterator[None]:
             raise Passed
         return real(rules, act, problems, *rest, **options)
 
-    assessment: Any = importlib.import_module("marl_handover.runtime.assessment")
+    assessment: Any = importlib.import_module("marl_handover.control.evaluation")
     real = assessment.evaluate
     before, home = signal.signal(signal.SIGPROF, too_long), os.getcwd()
     with contextlib.ExitStack() as stack:

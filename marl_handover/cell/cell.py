@@ -145,6 +145,24 @@ class Cell:
         """Which arms can place at positions (..., >= 2): bool (..., num_arms)."""
         return self.within(*self.polar(position_mm))
 
+    def clamp_to_workspace(self, pose: Array, slack_mm: float) -> Array:
+        """``pose`` (3,) as a supervisor is to see it.
+
+        One up to ``slack_mm`` outside every arm's sector, as placement noise may leave it, is shown at the nearest place inside, so that
+        the rule book lets an arm take it; the arm still goes for where it was measured, if its joints allow. Every other one is shown
+        where it is, also farther out: no arm can reach it.
+        """
+        square, yaw = self.polar(pose)
+        if self.within(square, yaw).any():
+            return pose
+        radius = np.clip(np.sqrt(square), self.r_min_mm, self.r_max_mm)
+        angle = self.gripper_yaw(np.clip(yaw, *self.yaw_rad))
+        bases = np.array([base.position_mm for base in self.bases])
+        places = bases + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+        away = np.hypot(*(places - pose[:2]).T)
+        nearest = int(away.argmin())
+        return np.array([*places[nearest], pose[2]]) if away[nearest] <= slack_mm else pose
+
     def _common(self, name: str) -> Any:
         values = [getattr(arm, name) for arm in self.arms]
         if any(value != values[0] for value in values):

@@ -12,16 +12,16 @@ import numpy as np
 from marl_handover.cell import build_cell
 from marl_handover.commands.person import Person, confirmed
 from marl_handover.config import CellConfig, MotionConfig, bounded, check_bounds, chosen, seed_field
+from marl_handover.control.settings import WorkcellConfig
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.settings import ARMS
-from marl_handover.runtime.settings import LabConfig
 
 if TYPE_CHECKING:
     from marl_handover.cell import CellModel
+    from marl_handover.control.calibration import Operator
+    from marl_handover.control.servo_calibration import Measured
+    from marl_handover.control.workcell import Devices
     from marl_handover.hardware.calibration import ArmCalibration
-    from marl_handover.runtime.camera_calibration import Assistant
-    from marl_handover.runtime.lab import Plugs
-    from marl_handover.runtime.servo_calibration import Measured
 
 DOUBTFUL_MM = 1.5
 """Sightings of sound servos are less far off, with errors twice the usual ones as well."""
@@ -35,7 +35,7 @@ WHAT = ("all", "camera", "servos", "grippers", "sheets")
 
 
 @dataclass
-class CalibrateCommand(LabConfig):
+class CalibrateCommand(WorkcellConfig):
     """Settings of ``calibrate``; files go to ``calibration=DIR``."""
 
     what: str = chosen("all", WHAT)  # camera, servos (needs camera), grippers (needs both), all, or sheets: what has to be printed
@@ -56,7 +56,7 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: CalibrateCommand) -> int:
     """Go through the procedures and save what they give."""
-    from marl_handover.runtime.lab import plug_in
+    from marl_handover.control.workcell import open_devices
 
     check_bounds(config)
     model = build_cell(config.cell)
@@ -66,15 +66,15 @@ def run(config: CalibrateCommand) -> int:
         config.hand_markers.validate(config.target)
         return _sheets(config, model)
     if config.what in ("all", "camera", "servos"):
-        plugs = plug_in(config, model, config.motion, confirmed)
+        devices = open_devices(config, model, config.motion, confirmed)
         try:
-            assistant: Assistant = plugs.twin or Person(config.hand_markers)
+            operator: Operator = devices.twin or Person(config.hand_markers)
             if config.what in ("all", "camera"):
-                _camera(config, plugs, assistant)
+                _camera(config, devices, operator)
             if config.what in ("all", "servos"):
-                _servos(config, plugs, assistant, model)
+                _servos(config, devices, operator, model)
         finally:
-            plugs.close()
+            devices.close()
     if config.what in ("all", "grippers"):
         _grippers(config, model)
     return 0
@@ -94,11 +94,11 @@ def _sheets(config: CalibrateCommand, model: CellModel) -> int:
     return 0
 
 
-def _camera(config: CalibrateCommand, plugs: Plugs, assistant: Assistant) -> None:
-    from marl_handover.runtime.camera_calibration import calibrate_camera
-    from marl_handover.runtime.lab import CAMERA_FILE
+def _camera(config: CalibrateCommand, devices: Devices, operator: Operator) -> None:
+    from marl_handover.control.calibration import calibrate_camera
+    from marl_handover.control.workcell import CAMERA_FILE
 
-    found = calibrate_camera(plugs.camera, plugs.clock, config.board, assistant, plugs.camera.name, config.views)
+    found = calibrate_camera(devices.camera, devices.clock, config.board, operator, devices.camera.name, config.views)
     path = config.folder() / CAMERA_FILE
     found.save(path)
     x, y, z = found.eye_mm()
@@ -108,21 +108,21 @@ def _camera(config: CalibrateCommand, plugs: Plugs, assistant: Assistant) -> Non
     )
 
 
-def _servos(config: CalibrateCommand, plugs: Plugs, assistant: Assistant, model: CellModel) -> None:
+def _servos(config: CalibrateCommand, devices: Devices, operator: Operator, model: CellModel) -> None:
+    from marl_handover.control.servo_calibration import ServoCalibration
+    from marl_handover.control.workcell import camera_calibration
+    from marl_handover.hardware.calibration import save_servos
     from marl_handover.hardware.driver import ArmDriver
     from marl_handover.hardware.estop import StopLatch
-    from marl_handover.runtime.lab import camera_calibration
-    from marl_handover.runtime.servo_calibration import ServoCalibration
-    from marl_handover.runtime.servo_files import save_servos
 
     seen_by = camera_calibration(config.folder())
-    assistant.glue_cards()
-    latch = StopLatch(plugs.hardware.stop_path())
-    driver = ArmDriver(plugs.hardware, model, config.motion, clock=plugs.clock, latch=latch, confirm=plugs.confirm)
+    operator.glue_cards()
+    latch = StopLatch(devices.hardware.stop_path())
+    driver = ArmDriver(devices.hardware, model, config.motion, clock=devices.clock, latch=latch, confirm=devices.confirm)
     found: dict[str, Measured] = {}
     with driver:
         driver.arm()
-        procedure = ServoCalibration(driver, plugs.camera, seen_by, config.target, config.hand_markers, config.seed, config.postures)
+        procedure = ServoCalibration(driver, devices.camera, seen_by, config.target, config.hand_markers, config.seed, config.postures)
         for arm, name in enumerate(ARMS):
             found[name] = measured = procedure.arm(arm)
             print(
@@ -137,25 +137,25 @@ def _servos(config: CalibrateCommand, plugs: Plugs, assistant: Assistant, model:
         {name: measured.half_band_sd_us for name, measured in found.items()},
     )
     print(f"-> {config.folder()}")
-    assistant.take_cards_off()
+    operator.take_cards_off()
 
 
 def _grippers(config: CalibrateCommand, model: CellModel) -> None:
+    from marl_handover.control.calibration import Grip, GripperCalibration, places
+    from marl_handover.control.hardware_backend import HardwareBackend
+    from marl_handover.hardware.calibration import save_grippers
     from marl_handover.motion.planner import MotionPlanner
-    from marl_handover.runtime.gripper_calibration import Grip, GripperCalibration, places
-    from marl_handover.runtime.gripper_file import save_grippers
-    from marl_handover.runtime.hardware_backend import HardwareBackend
 
     planner = MotionPlanner(model, config.motion)
     planner.warm_up()
     backend = HardwareBackend(model, config.motion, config=config, confirm=confirmed, grippers=False)
     found: dict[str, Grip] = {}
     try:
-        assistant: Assistant = backend.lab.twin or Person(config.hand_markers)
+        operator: Operator = backend.workcell.twin or Person(config.hand_markers)
         first = places(model.cell)[0]
-        assistant.stand_block(first)
+        operator.stand_block(first)
         backend.reset(np.array(first), config.seed)
-        procedure = GripperCalibration(backend, planner, assistant, _told)
+        procedure = GripperCalibration(backend, planner, operator, _told)
         for arm, name in enumerate(ARMS):
             found[name] = grip = procedure.arm(arm)
             print(

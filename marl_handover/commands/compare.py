@@ -101,13 +101,13 @@ def _require_done(results: dict[str, Any], tasks: int, others: Sequence[str], re
 def _calibrate_twin(tasks: Sequence[Task]) -> None:
     """Calibrate the twin as it is shipped, if a task is to be judged on it and nobody has done so yet."""
     from marl_handover.commands import calibrate
-    from marl_handover.runtime.lab import is_calibrated
-    from marl_handover.runtime.settings import twin_lab
+    from marl_handover.control.settings import twin_workcell
+    from marl_handover.control.workcell import is_calibrated
 
     configs = [job.config for task in tasks for job in task.jobs]
-    if any(config.backend == "twin" and config.calibration is None for config in configs) and not is_calibrated(twin_lab().folder()):
-        print(f"calibrating the twin first, into {twin_lab().folder()}", file=sys.stderr)
-        calibrate.run(calibrate.CalibrateCommand(**vars(twin_lab())))
+    if any(config.backend == "twin" and config.calibration is None for config in configs) and not is_calibrated(twin_workcell().folder()):
+        print(f"calibrating the twin first, into {twin_workcell().folder()}", file=sys.stderr)
+        calibrate.run(calibrate.CalibrateCommand(**vars(twin_workcell())))
 
 
 def _run_tasks(config: CompareConfig, tasks: Sequence[Task]) -> tuple[dict[str, str], list[str]]:

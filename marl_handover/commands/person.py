@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from marl_handover.errors import WorkFailed
 
 if TYPE_CHECKING:
+    from marl_handover.control.settings import CardConfig
     from marl_handover.perception.sheets import Sheet
-    from marl_handover.runtime.settings import CardConfig
 
 
 class NobodyThere(WorkFailed):
@@ -32,7 +32,7 @@ def laid_anew() -> None:
 
 
 class Person:
-    """Does what :class:`~marl_handover.runtime.camera_calibration.Assistant` asks, after Enter was pressed."""
+    """Does what :class:`~marl_handover.control.calibration.Operator` asks, after Enter was pressed."""
 
     def __init__(self, cards: CardConfig) -> None:
         self._cards = cards

@@ -115,7 +115,7 @@ def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> N
     """
     from marl_handover.motion.coordination import coordinate
     from marl_handover.report.figure_style import save_figure, write_json
-    from marl_handover.runtime.motions import motion_row, plan_motions
+    from marl_handover.report.motion import motion_row, plan_motions
 
     planner.warm_up()
     done = [transfer for transfer in plan["transfers"] if not transfer["refused"]]

@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 from marl_handover import policies
 from marl_handover.commands.person import confirmed, laid_anew
 from marl_handover.config import POSE, CellConfig, LoopConfig, MotionConfig, TaskChanges, bounded, check_bounds, path_field, seed_field
+from marl_handover.control.settings import WorkcellConfig
 from marl_handover.errors import InvalidSetting, MissingFile, OutOfReach
-from marl_handover.runtime.settings import LabConfig
 from marl_handover.wording import counted
 
 if TYPE_CHECKING:
-    from marl_handover.runtime.episode import Episode
-    from marl_handover.runtime.loop import ClosedLoop
-    from marl_handover.runtime.session import Session
+    from marl_handover.control.closed_loop import ClosedLoop
+    from marl_handover.control.session import Session
+    from marl_handover.control.transfers import Episode
     from marl_handover.task.rules import Rules
 
 Floats = NDArray[np.float64]
 
 
 @dataclass
-class RunCommand(LabConfig):
+class RunCommand(WorkcellConfig):
     """Settings of ``run``."""
 
     policy: str = path_field("pretrained_twin")  # exact, random, greedy, pretrained_a or _b or _twin, a run directory or a policy file
@@ -57,10 +57,10 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: RunCommand) -> int:
     """Play and print. 0 if every episode ended at its goal, else 1."""
-    from marl_handover.runtime.loop import make_loop
-    from marl_handover.runtime.pace import keep_pace
-    from marl_handover.runtime.publishing import Publisher
-    from marl_handover.runtime.session import Session
+    from marl_handover.control.closed_loop import make_loop
+    from marl_handover.control.session import Session
+    from marl_handover.control.telemetry import Publisher
+    from marl_handover.hardware.clock import follow_real_time
 
     _check(config)
     policy = policies.adapted(config.policy, config.cell, config.seed, motion=config.motion, **vars(config.task))
@@ -71,9 +71,9 @@ def run(config: RunCommand) -> int:
         make_loop(policy, "hardware", config.motion, config.loop, **options) as loop,
     ):
         publisher.attach(loop)
-        session = Session(loop, about, publisher.desk)
+        session = Session(loop, about, publisher.command_queue)
         if config.real_time:
-            keep_pace(session.backend.clock)
+            follow_real_time(session.backend.clock)
         solved = 0
         for number, (start, goal) in enumerate(_problems(config, loop.rules)):
             if number and not config.emulated:
@@ -121,9 +121,9 @@ def _pose(name: str, value: list[float] | None, rules: Rules) -> Floats | None:
 
 
 def _play(config: RunCommand, session: Session, loop: ClosedLoop, start: Floats, goal: Floats | None, seed: int) -> Episode:
-    from marl_handover.runtime.session import GivenGoal
+    from marl_handover.control.session import GivenGoal
 
-    twin = session.backend.lab.twin
+    twin = session.backend.workcell.twin
     if goal is not None and not (config.printed and twin is not None):
         return session.play(start, GivenGoal(goal), seed)
     if twin is not None:
@@ -133,7 +133,7 @@ def _play(config: RunCommand, session: Session, loop: ClosedLoop, start: Floats,
 
 
 def _tell(number: int, episode: Episode, wall_s: float) -> None:
-    from marl_handover.runtime.session import transfer_line
+    from marl_handover.control.session import transfer_line
 
     print(f"episode {number}: {episode.ended} after {counted(len(episode.transfers), 'transfer')}, {wall_s:.1f} s", flush=True)
     for transfer in episode.transfers:
@@ -141,6 +141,6 @@ def _tell(number: int, episode: Episode, wall_s: float) -> None:
 
 
 def _faults() -> frozenset[Any]:
-    from marl_handover.runtime.events import FAULTS
+    from marl_handover.control.events import FAULTS
 
     return FAULTS

@@ -147,7 +147,7 @@ def _changed(group: str, values: Mapping[str, Any], usual: Mapping[str, Any]) ->
 def _play(config: ViewCommand, server: Server) -> Iterator[Page]:
     from marl_handover import policies
     from marl_handover.cell import build_cell
-    from marl_handover.runtime.interactive.cell import InteractiveCell
+    from marl_handover.control.interactive.cell import InteractiveCell
     from marl_handover.viewer.play import RATE_HZ, SPEEDS, PlayPage
 
     require_between("speed", config.speed, *SPEEDS)
@@ -192,7 +192,7 @@ def _cell(config: ViewCommand, recorded: dict[str, Any] | None) -> CellConfig:
 @contextlib.contextmanager
 def _live(config: ViewCommand, server: Server) -> Iterator[Page]:
     from marl_handover.cell import build_cell
-    from marl_handover.runtime.publishing import Feed
+    from marl_handover.control.telemetry import TelemetryReader
     from marl_handover.viewer.live import LivePage
     from marl_handover.viewer.scene import CellScene
 
@@ -200,7 +200,7 @@ def _live(config: ViewCommand, server: Server) -> Iterator[Page]:
     if not folder.is_dir():
         raise MissingFile("folder", folder, "give the one that the session runs with as publish=FOLDER")
     scene = CellScene(server, build_cell(config.cell or CellConfig()))  # until the session says which cell it has
-    page = LivePage(server, scene, Feed(folder))
+    page = LivePage(server, scene, TelemetryReader(folder))
     yield Page(page.update, LIVE_HZ)
 
 

@@ -200,8 +200,8 @@ BACKENDS = {
     "kinematic": f"{__name__}:KinematicBackend",
     "noisy": f"{__name__}:NoisyBackend",
     "bullet": "marl_handover.simulation.backend:BulletBackend",
-    "twin": "marl_handover.runtime.hardware_backend:TwinBackend",
-    "hardware": "marl_handover.runtime.hardware_backend:HardwareBackend",
+    "twin": "marl_handover.control.hardware_backend:TwinBackend",
+    "hardware": "marl_handover.control.hardware_backend:HardwareBackend",
 }
 """Name -> "module:Class", imported at use: the environments need no simulator."""
 

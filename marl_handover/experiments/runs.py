@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from marl_handover.compose import Groups, compose
+from marl_handover.control.evaluation import AssessmentConfig
+from marl_handover.control.settings import twin_workcell
 from marl_handover.errors import HandoverError, InvalidSetting, UnknownChoice, WorkFailed
 from marl_handover.experiments import provenance
 from marl_handover.experiments.provenance import fingerprint, read_record, settings_of, write_record
@@ -22,8 +24,6 @@ from marl_handover.learning.settings import TrainConfig
 from marl_handover.locks import held
 from marl_handover.policies.registry import NAMES
 from marl_handover.policies.shielded import SHIELDED
-from marl_handover.runtime.assessment import AssessmentConfig
-from marl_handover.runtime.settings import twin_lab
 
 ASKED, TRAINED, DONE = (f"{name}.json" for name in RECORDS)
 RUN_FOLDER = "run"
@@ -45,7 +45,7 @@ class EvaluationJob:
     def placed(self) -> AssessmentConfig:
         """The settings with absolute paths: a worker may stand in another folder."""
         problems = self.config.problems and str(self.base / expanded(self.config.problems))
-        folder = self.config.calibration or (str(twin_lab().folder()) if self.config.backend == "twin" else None)
+        folder = self.config.calibration or (str(twin_workcell().folder()) if self.config.backend == "twin" else None)
         return replace(self.config, problems=problems, calibration=folder and str(self.base / expanded(folder)))
 
     def contents(self) -> dict[str, str]:
@@ -226,7 +226,7 @@ def _train(task: Task, config: TrainConfig, here: Mapping[str, Any]) -> None:
 
 
 def _judge(task: Task, job: EvaluationJob, here: Mapping[str, Any]) -> None:
-    from marl_handover.runtime.assessment import assess
+    from marl_handover.control.evaluation import assess
 
     settings = settings_of(job.config)
     contents = job.contents()

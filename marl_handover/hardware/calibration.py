@@ -1,4 +1,4 @@
-"""Pulse width to joint angle and back: what was measured, the line through it, and the file it is kept in.
+"""Servos and grippers as they were calibrated: the maps from pulse to joint angle, and the files of it all.
 
 Scales differ by up to a quarter between servo types, and horns sit on splines 15 degrees apart, so every joint of every arm needs at least
 two measured points. A servo rests anywhere in its dead band, hence each pulse is best approached from both sides.
@@ -6,24 +6,26 @@ two measured points. A servo rests anywhere in its dead band, hence each pulse i
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from marl_handover.config import require_choice
+from marl_handover.config import require_between, require_choice
 from marl_handover.errors import CorruptFile, HandoverError, MissingFile
-from marl_handover.files import keep, make_folder, write_whole
+from marl_handover.files import keep, make_folder, read_bounded, write_together, write_whole
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.hardware.settings import ARMS, HardwareConfig
-from marl_handover.parsing import read_json
+from marl_handover.hardware.protocol import PULSE_US
+from marl_handover.hardware.settings import ARMS, GripperConfig, HardwareConfig
+from marl_handover.parsing import JSON_BYTES, read_json
 
 Floats = NDArray[np.float64]
 
@@ -34,6 +36,22 @@ SCALE_LIMITS = (4.0, 16.0)
 
 RESIDUAL_LIMIT_DEG = 4.0
 """How far a measured point may be off the fitted map: four dead bands."""
+
+BACKLASH_VERSION = 2
+BACKLASH_FILE = "play.json"
+_SERVOS_AGAIN = "run: marl-handover calibrate what=servos hardware=NAME, with the name you run"
+MOST_US = 20.0
+
+SET_FILE = "servos.json"
+"""Names the others' content, so that files of two calibrations are told from those of one."""
+
+_SET_VERSION = 1
+
+GRIPPERS_FILE = "grippers.json"
+_GRIPPERS_VERSION = 1
+_GRIPPERS_FOUND = ("open_us", "closed_us")
+_GRIPPERS_ASKED = (*_GRIPPERS_FOUND, "open_mm")
+_GRIPPERS_AGAIN = "run: marl-handover calibrate what=grippers hardware=NAME, with the name you run"
 
 
 class CalibrationProblem(HandoverError):
@@ -228,3 +246,161 @@ def _interpolate(x: Floats, xs: Floats, ys: Floats) -> Floats:
     index = np.clip(np.searchsorted(xs, x) - 1, 0, len(xs) - 2)
     slope = (ys[index + 1] - ys[index]) / (xs[index + 1] - xs[index])
     return np.asarray(ys[index] + slope * (x - xs[index]))
+
+
+def half_bands_rad(half_us: Mapping[str, ArrayLike], calibrations: Sequence[ArmCalibration]) -> Floats:
+    """(num_arms, 5) in rad of half dead bands (5,) given in us, arm by arm."""
+    scales = np.array([[servo.us_per_rad() for servo in calibration.maps] for calibration in calibrations])
+    return np.array([half_us[arm] for arm in ARMS], float) / scales
+
+
+def backlash_text(half_us: Mapping[str, ArrayLike], sd_us: Mapping[str, ArrayLike]) -> str:
+    """What the file holds: half the dead bands (5,) in us of each arm's servos, and their standard deviations (5,)."""
+
+    def listed(values: Mapping[str, ArrayLike]) -> dict[str, dict[str, float]]:
+        rows = {arm: np.round(np.asarray(values[arm], float), 3).tolist() for arm in ARMS}
+        return {arm: dict(zip(ARM_JOINTS, row, strict=True)) for arm, row in rows.items()}
+
+    content = {"version": BACKLASH_VERSION, "half_band_us": listed(half_us), "half_band_sd_us": listed(sd_us)}
+    return json.dumps(content, indent=1) + "\n"
+
+
+def load_backlash(folder: Path) -> dict[str, Floats]:
+    """Half the dead bands (5,) in us, by arm. Raises :class:`MissingFile`, :class:`CorruptFile` or :class:`InvalidSetting`."""
+    path = folder / BACKLASH_FILE
+    if not path.is_file():
+        raise MissingFile("backlash of the servos", path, _SERVOS_AGAIN)
+    try:
+        content = read_json(path, "backlash of the servos")
+        if content["version"] != BACKLASH_VERSION:
+            why = f"it has version {content['version']!r}, this program reads {BACKLASH_VERSION}, a band for each joint"
+            raise CorruptFile("backlash of the servos", path, f"{why}; {_SERVOS_AGAIN}")
+        found = {arm: np.array([float(content["half_band_us"][arm][joint]) for joint in ARM_JOINTS]) for arm in ARMS}
+        for arm, values in found.items():
+            for joint, value in zip(ARM_JOINTS, values, strict=True):
+                require_between(f"half_band_us.{arm}.{joint}", float(value), 0.0, MOST_US)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise CorruptFile("backlash of the servos", path, f"{type(error).__name__}: {error}") from error
+    return found
+
+
+def arm_file(arm: str) -> str:
+    """The name of an arm's file."""
+    return f"{arm}.json"
+
+
+SERVO_FILES = (*(arm_file(arm) for arm in ARMS), BACKLASH_FILE)
+
+
+def save_servos(folder: Path, arms: Mapping[str, ArmCalibration], half_us: Mapping[str, ArrayLike], sd_us: Mapping[str, ArrayLike]) -> None:
+    """Write what was found for all arms into ``folder``; what was there is kept beside it. The last file makes the others valid.
+
+    Args:
+        folder: where; made if it is missing.
+        arms: calibration of each arm.
+        half_us: half the dead bands (5,) in us of each arm's servos.
+        sd_us: their standard deviations (5,).
+
+    Raises:
+        CannotWrite: there is no room for them, and then those that were there stay.
+    """
+    make_folder(folder)
+    texts = {arm_file(arm): arms[arm].text() for arm in ARMS} | {BACKLASH_FILE: backlash_text(half_us, sd_us)}
+    digests = {name: hashlib.sha256(texts[name].encode()).hexdigest() for name in SERVO_FILES}
+    texts[SET_FILE] = json.dumps({"version": _SET_VERSION, "sha256": digests}, indent=1) + "\n"
+    for name in texts:
+        keep(folder / name)
+    write_together({folder / name: text for name, text in texts.items()})
+
+
+def require_one_set(folder: Path, names: Collection[str] = SERVO_FILES) -> None:
+    """See that the files ``names`` in ``folder`` come from one calibration.
+
+    Raises:
+        MissingFile: one is not there.
+        CorruptFile: the one that names the others cannot be read.
+        CalibrationProblem: they do not belong together, or were changed since.
+    """
+    for name in (*names, SET_FILE):
+        if not (folder / name).is_file():
+            raise MissingFile("servo calibration", folder / name, _SERVOS_AGAIN)
+    path = folder / SET_FILE
+    try:
+        content = read_json(path, "servo calibration")
+        if content["version"] != _SET_VERSION:
+            raise CorruptFile(
+                "servo calibration", path, f"it has version {content['version']!r}, this program reads {_SET_VERSION}; {_SERVOS_AGAIN}"
+            )
+        wanted = {name: str(content["sha256"][name]) for name in names}
+        others = [name for name in names if _digest(folder / name) != wanted[name]]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise CorruptFile("servo calibration", path, f"{type(error).__name__}: {error}") from error
+    if others:
+        raise CalibrationProblem(str(folder), f"{' and '.join(others)} changed since the others were written; {_SERVOS_AGAIN}")
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(read_bounded(path, JSON_BYTES, "servo calibration")).hexdigest()
+
+
+def shifted(gripper: GripperConfig, further_mm: float) -> GripperConfig:
+    """``gripper`` with pulses at which each finger is ``further_mm`` nearer to closed.
+
+    Raises:
+        InvalidSetting: a servo has no such pulses.
+    """
+    shift_us = round(further_mm / gripper.open_mm * (gripper.closed_us - gripper.open_us))
+    moved = replace(gripper, open_us=gripper.open_us + shift_us, closed_us=gripper.closed_us + shift_us)
+    for name in _GRIPPERS_FOUND:
+        require_between(f"gripper.{name}", getattr(moved, name), *PULSE_US)
+    return moved
+
+
+def save_grippers(folder: Path, asked: Mapping[str, GripperConfig], found: Mapping[str, GripperConfig]) -> Path:
+    """Write what was found for all hands, whose settings were ``asked``, into ``folder``; what was there is kept beside it. Its path.
+
+    Raises:
+        CannotWrite: there is no room, or no folder.
+    """
+    path = folder / GRIPPERS_FILE
+    arms = {arm: {"settings": _picked(asked[arm], _GRIPPERS_ASKED), "found": _picked(found[arm], _GRIPPERS_FOUND)} for arm in ARMS}
+    content = {"version": _GRIPPERS_VERSION, "measured_unix_s": time.time(), "arms": arms}
+    keep(path)
+    write_whole(path, json.dumps(content, indent=1) + "\n")
+    return path
+
+
+def with_grippers(hardware: HardwareConfig, folder: Path) -> HardwareConfig:
+    """``hardware`` with the pulses that were found for its hands; as it is if nobody has calibrated them.
+
+    Raises:
+        CorruptFile: the file cannot be read.
+        CalibrationProblem: its hands were set otherwise.
+    """
+    path = folder / GRIPPERS_FILE
+    if not path.is_file():
+        return hardware
+    try:
+        content = read_json(path, "gripper calibration")
+        if content["version"] != _GRIPPERS_VERSION:
+            raise CorruptFile(
+                "gripper calibration",
+                path,
+                f"it has version {content['version']!r}, this program reads {_GRIPPERS_VERSION}; {_GRIPPERS_AGAIN}",
+            )
+        asked = {arm: {name: float(content["arms"][arm]["settings"][name]) for name in _GRIPPERS_ASKED} for arm in ARMS}
+        found = {arm: {name: int(content["arms"][arm]["found"][name]) for name in _GRIPPERS_FOUND} for arm in ARMS}
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise CorruptFile("gripper calibration", path, f"{type(error).__name__}: {error}") from error
+    for arm in ARMS:
+        now = _picked(hardware.arms[arm].gripper, _GRIPPERS_ASKED)
+        if now != asked[arm]:
+            raise CalibrationProblem(f"the {arm} gripper", f"{path} was found for {asked[arm]}, the settings say {now}; {_GRIPPERS_AGAIN}")
+        if not all(PULSE_US[0] <= pulse <= PULSE_US[1] for pulse in found[arm].values()):
+            raise CorruptFile("gripper calibration", path, f"pulses of {found[arm]}, a servo takes {PULSE_US[0]} to {PULSE_US[1]} us")
+    arms = {arm: replace(wiring, gripper=replace(wiring.gripper, **found[arm])) for arm, wiring in hardware.arms.items()}
+    return replace(hardware, arms=arms)
+
+
+def _picked(gripper: GripperConfig, names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: getattr(gripper, name) for name in names}

@@ -7,7 +7,7 @@ What is promised of that room: nowhere on the way of a command that passed, betw
 or to the other arm than ``table_clearance_mm``, ``self_clearance_mm`` and ``arm_clearance_mm``, less 0.1 mm. A hand that is closed is
 taken to hold the block, since nothing says that it is empty. The block and its pin keep the same distances, but for the table, on which
 the block stands when it is taken and set down: its lowest point, in whatever way it is turned about the pin, is nowhere lower than
-``block_dip_mm`` under the table, less 0.1 mm. Aims that take out the play of servos are that much below what is meant.
+``block_dip_mm`` under the table, less 0.1 mm. Aims that take out the backlash of servos are that much below what is meant.
 """
 
 from __future__ import annotations

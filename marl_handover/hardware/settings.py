@@ -87,7 +87,7 @@ class SafetyFilterConfig:
     table_clearance_mm: float = bounded(0.5, 0.0, 50.0)  # of every link after the turret
     arm_clearance_mm: float = bounded(3.0, 0.0, 100.0)
     self_clearance_mm: float = bounded(0.0, 0.0, 50.0)
-    block_dip_mm: float = bounded(6.0, 0.0, 12.0)  # a held block may be sent this far under the table: aims that take out play are
+    block_dip_mm: float = bounded(6.0, 0.0, 12.0)  # a held block may be sent this far under the table: aims that take out backlash are
     stale_s: float = bounded(0.25, 0.02, 2.0)  # a command older than this is not sent
     finger_mm: float = bounded(16.0, 1.0, 50.0)  # greatest opening of each finger
     finger_mm_s: float = bounded(95.0, 1.0, 500.0)  # greatest speed of each finger

@@ -16,7 +16,6 @@ from marl_handover.config import LoopConfig
 from marl_handover.errors import CorruptFile, InvalidSetting
 from marl_handover.files import read_lines
 from marl_handover.parsing import LINES_BYTES, parse_object
-from marl_handover.runtime.reach import drawn_in
 from marl_handover.task.rules import ROUNDING_RAD, Command, Outcome, Rules
 
 Floats = NDArray[np.float64]
@@ -160,8 +159,8 @@ def errors_at_end(trace: Trace, symmetry_order: int) -> tuple[Floats, Floats]:
 
 def as_seen(cell: Cell, poses: Floats) -> Floats:
     """Measured poses (n, 3) as the closed loop shows them to a policy: those just out of reach at the edge of it."""
-    edge_mm = LoopConfig().reach_slack_mm
-    return np.stack([drawn_in(cell, pose, edge_mm) for pose in poses]) if len(poses) else poses
+    slack_mm = LoopConfig().reach_slack_mm
+    return np.stack([cell.clamp_to_workspace(pose, slack_mm) for pose in poses]) if len(poses) else poses
 
 
 def foreseen(trace: Trace, rules: Rules) -> Integers:

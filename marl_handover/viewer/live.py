@@ -1,7 +1,7 @@
 """The page on which a session with real arms, or the twin's, is watched and, if it allows that, steered.
 
 The session is another process. All that joins them is the folder it publishes in, so that nothing that happens here reaches it but what
-a :class:`~marl_handover.runtime.feed.Feed` asks for.
+a :class:`~marl_handover.control.telemetry_reader.TelemetryReader` asks for.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from marl_handover.cell import CellModel, build_cell
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import BlockConfig, CellConfig
+from marl_handover.control.events import FAULTS
+from marl_handover.control.remote_control import MAX_AGE_S, SessionCommand
+from marl_handover.control.telemetry_reader import Reading, TelemetryReader
 from marl_handover.errors import HandoverError
 from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.hardware.settings import ARMS
 from marl_handover.palette import ALERT, BLUE, GREY, INK, PAPER, YELLOW
-from marl_handover.runtime.events import FAULTS
-from marl_handover.runtime.feed import Feed, Reading
-from marl_handover.runtime.steering import MAX_AGE_S, Ask
 from marl_handover.viewer import live as live_words
 from marl_handover.viewer.scene import CellScene
 from marl_handover.viewer.words import DOING, at_once
@@ -217,7 +217,7 @@ class LivePage:
         feed: of the folder.
     """
 
-    def __init__(self, server: viser.ViserServer, scene: CellScene | None, feed: Feed) -> None:
+    def __init__(self, server: viser.ViserServer, scene: CellScene | None, feed: TelemetryReader) -> None:
         self.server, self.scene, self.feed = server, scene, feed
         self._said: dict[str, str] = {}
         self._events: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
@@ -285,17 +285,17 @@ class LivePage:
         with gui.add_folder("events, newest first"):
             self._log = gui.add_html("")
         stop.on_click(at_once(self.stop))
-        self._start.on_click(lambda _: self._ask(Ask.START))
-        self._pause.on_click(lambda _: self._ask(Ask.PAUSE))
-        self._send.on_click(lambda _: self._ask(Ask.GOAL))
+        self._start.on_click(lambda _: self._ask(SessionCommand.START))
+        self._pause.on_click(lambda _: self._ask(SessionCommand.PAUSE))
+        self._send.on_click(lambda _: self._ask(SessionCommand.GOAL))
 
     def stop(self) -> None:
         """Latch the stop. From any thread; it does not wait for anything on this page."""
         self._stopping = (time.monotonic(), self.feed.stop(STOP_REASON))
 
-    def _ask(self, command: Ask) -> None:
+    def _ask(self, command: SessionCommand) -> None:
         x_mm, y_mm, turn_deg = self._goal.value
-        goal = [x_mm, y_mm, math.radians(turn_deg)] if command is Ask.GOAL else None
+        goal = [x_mm, y_mm, math.radians(turn_deg)] if command is SessionCommand.GOAL else None
         if not self._asking.acquire(blocking=False):
             return  # somebody's request is being written; a viewer that asks without end fills no queue
         try:

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.cell import Cell
 from marl_handover.config import require_choice
+from marl_handover.control.interactive.cell import InteractiveCell, Snapshot
 from marl_handover.errors import HandoverError
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.runtime.interactive.cell import InteractiveCell, Snapshot
 from marl_handover.viewer.scene import CellScene
 from marl_handover.viewer.words import at_once, by_hand, decision_words, flat, number, plain, score_words, state_words, write, yaw_of
 

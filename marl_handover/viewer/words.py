@@ -11,7 +11,7 @@ import viser
 from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.runtime.interactive.cell import Placement, Snapshot
+from marl_handover.control.interactive.cell import Placement, Snapshot
 from marl_handover.task.rules import Rules
 from marl_handover.wording import counted
 

@@ -9,6 +9,7 @@ import torch
 from marl_handover import cli, policies
 from marl_handover.baselines.centralised import with_actions
 from marl_handover.commands.plan import solve
+from marl_handover.control.evaluation import AssessmentConfig, assess
 from marl_handover.errors import InvalidSetting, UnknownChoice
 from marl_handover.learning.algorithm import stepped
 from marl_handover.learning.checkpoint import policy_arrays, save_policy
@@ -16,7 +17,6 @@ from marl_handover.learning.trainer import Trainer
 from marl_handover.learning.variant import make_variant
 from marl_handover.motion.transfer_features import mirrored_numbers
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.runtime.assessment import AssessmentConfig, assess
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Rules
 from tests.symmetries import GROUP, flips_x

@@ -18,10 +18,10 @@ import twin_work
 
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import MotionConfig
+from marl_handover.control.settings import twin_workcell
+from marl_handover.control.twin import Twin
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.estop import StopLatch
-from marl_handover.runtime.settings import twin_lab
-from marl_handover.runtime.twin import Twin
 
 PARKED = np.radians(MotionConfig().parked_deg)
 
@@ -33,7 +33,7 @@ def row(number: int, **more: Any) -> dict[str, Any]:
 @pytest.fixture
 def armed(tmp_path: Path) -> Any:
     model = build_cell(cell_config("paper"))
-    config = twin_lab()
+    config = twin_workcell()
     config.hardware.arms["left"].pulse_limits_us = [[600, 2400]] * 5
     twin = Twin(model, MotionConfig(), config)
     driver = ArmDriver(twin.hardware, model, MotionConfig(), clock=twin.clock, latch=StopLatch(tmp_path / "stop"), confirm=twin.confirm)

@@ -13,15 +13,13 @@ from marl_handover.cell import build_cell, cell_config
 from marl_handover.cli import main
 from marl_handover.commands.person import Person, confirmed
 from marl_handover.config import MotionConfig
+from marl_handover.control.settings import CardConfig, twin_workcell
 from marl_handover.errors import WorkFailed
-from marl_handover.hardware.calibration import load_calibration, nominal_calibration
+from marl_handover.hardware.calibration import load_backlash, load_calibration, nominal_calibration, require_one_set
 from marl_handover.hardware.emulator.device import EmulatedCell
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.settings import ARMS
 from marl_handover.perception.calibration import CameraCalibration, hung_camera
-from marl_handover.runtime.play import load_play
-from marl_handover.runtime.servo_files import require_one_set
-from marl_handover.runtime.settings import CardConfig, twin_lab
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +28,7 @@ def model():
 
 
 def test_the_camera_maps_the_table_to_a_millimetre(twin_calibration):
-    config = twin_lab()
+    config = twin_workcell()
     truth = hung_camera(config.mount, (config.camera.width_px, config.camera.height_px))
     found = CameraCalibration.load(twin_calibration / "camera.json")
     points = np.array([[x, y, 15.0] for x in (-150, 0, 150) for y in (-250, 0, 250)], float)
@@ -38,7 +36,7 @@ def test_the_camera_maps_the_table_to_a_millimetre(twin_calibration):
 
 
 def test_servos_come_out_far_nearer_than_nominal_ones(twin_calibration, model):
-    config = twin_lab().hardware
+    config = twin_workcell().hardware
     truths = EmulatedCell(config, model.arm, np.radians(MotionConfig().parked_deg)).truths
     q = np.stack([model.arm.ik(np.array([radius, side, 45.0]))[0] for radius in (165, 190, 215) for side in (-60.0, 60.0)])
     for name in ARMS:
@@ -51,7 +49,7 @@ def test_servos_come_out_far_nearer_than_nominal_ones(twin_calibration, model):
         assert errors[0] < 4.0 < errors[1], "mm at the grip"
         bands = np.array([truth.dead_band_us for truth in truths[name][:5]])
         assert np.ptp(bands) > 1.0, "no two servos are alike"
-        off = np.abs(2 * load_play(twin_calibration)[name] - bands)
+        off = np.abs(2 * load_backlash(twin_calibration)[name] - bands)
         assert off[:3].max() < 3.0, "base, shoulder, elbow: the ones that move the hand"
         assert off.max() < 6.0
 

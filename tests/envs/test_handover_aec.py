@@ -17,6 +17,7 @@ from torchrl.envs.utils import check_env_specs
 
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import LoopConfig, MotionConfig, NoiseConfig, RewardConfig, TaskConfig
+from marl_handover.control.closed_loop import make_loop
 from marl_handover.envs import SupervisorEnv, handover_aec
 from marl_handover.envs.backends import KinematicBackend, Refusal
 from marl_handover.envs.top_view import GOAL
@@ -24,7 +25,6 @@ from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownC
 from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.policies import load
-from marl_handover.runtime.loop import make_loop
 from marl_handover.task.rules import Outcome, Rules
 
 SUPERVISOR, LEFT, RIGHT = "supervisor", "arm_left", "arm_right"

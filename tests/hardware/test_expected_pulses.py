@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from marl_handover.control.trajectory_player import stream
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.connection import State
 from marl_handover.hardware.emulator.board import EmulatedBoard
@@ -18,7 +19,6 @@ from marl_handover.hardware.errors import BadReply, DeviceError, PulseMismatch, 
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.settings import BoardConfig, TimeoutConfig
 from marl_handover.hardware.ssc32 import FRAME_S, ExpectedPulses, Ssc32
-from marl_handover.hardware.streaming import stream
 from marl_handover.motion.trajectory import Phase
 
 

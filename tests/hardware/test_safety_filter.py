@@ -174,7 +174,7 @@ def level(model, radius_mm, height_mm, yaw_deg=0.0):
 
 @pytest.mark.parametrize("radius_mm", [180.0, 190.0, 225.0])
 def test_a_closed_hand_does_not_press_the_block_into_the_table(model, gate, radius_mm):
-    """It is taken from the table and set down there; 6 mm below are for aims that take out the play of servos, 15 mm are not."""
+    """It is taken from the table and set down there; 6 mm below are for aims that take out the backlash of servos, 15 mm are not."""
     above, at, below, deep = (level(model, radius_mm, LEVEL_MM + more_mm) for more_mm in (15.0, 0.0, -5.0, -15.0))
     for start, end in [(at, above), (above, at), (at, below)]:
         gate.refer(0, start, 0.0)

@@ -8,12 +8,12 @@ import re
 import numpy as np
 import pytest
 
+from marl_handover.control.trajectory_player import stream
 from marl_handover.hardware.connection import State
 from marl_handover.hardware.errors import Stopped
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.hardware.settings import ARMS
-from marl_handover.hardware.streaming import stream
 from marl_handover.motion.trajectory import Phase
 
 WITHIN_S = 0.04

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from marl_handover.control.trajectory_player import stream
 from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.connection import State
 from marl_handover.hardware.emulator.device import make_fault
 from marl_handover.hardware.errors import BoardReset, PortLost, Stalled
 from marl_handover.hardware.safety_filter import CommandRejected
-from marl_handover.hardware.streaming import stream
 from marl_handover.motion.trajectory import Phase
 
 

@@ -12,8 +12,7 @@ from marl_handover.cell import build_cell, cell_config
 from marl_handover.errors import CorruptFile, InvalidSetting
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.report.figure_style import save_figure
-from marl_handover.report.motion import SHOWN_MM, motion_figure, read_motions, require_fit
-from marl_handover.runtime.motions import motion_row, plan_motions
+from marl_handover.report.motion import SHOWN_MM, motion_figure, motion_row, plan_motions, read_motions, require_fit
 
 
 @pytest.fixture(scope="module")

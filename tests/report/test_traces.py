@@ -9,9 +9,9 @@ import pytest
 
 from marl_handover.cell import load_cell
 from marl_handover.config import TaskChanges, TaskConfig
+from marl_handover.control.evaluation import AssessmentConfig, assess
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
 from marl_handover.report.traces import errors_at_end, foreseen, read_trace, symmetry_of
-from marl_handover.runtime.assessment import AssessmentConfig, assess
 from marl_handover.task.rules import Outcome, Rules
 
 EPISODES = 80

@@ -6,7 +6,7 @@ import pytest
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
-from marl_handover.runtime.motions import grip_mm
+from marl_handover.report.motion import grip_mm
 from marl_handover.simulation.camera import TOP, view
 
 

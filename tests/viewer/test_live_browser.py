@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from marl_handover.runtime.feed import Feed
+from marl_handover.control.telemetry_reader import TelemetryReader
 
 pytestmark = pytest.mark.slow
 
@@ -52,13 +52,13 @@ def test_a_session_is_started_watched_and_stopped_from_the_page(serving, opened,
             says(page, "confidence 0\\.[0-9]+")
             says(page, "to the goal")
             page.close()  # whoever closes the tab disturbs nobody
-            before = Feed(folder).read().state["number"]
+            before = TelemetryReader(folder).read().state["number"]
             page = opened(address)
             says(page, "(left|right) arm carries")
             time.sleep(1.0)
             shot = page.screenshot(path=os.environ.get("LIVE_SHOT", str(tmp_path / "live.png")))
             assert colours(shot) > LEAST_COLOURS
-            assert Feed(folder).read().state["number"] > before
+            assert TelemetryReader(folder).read().state["number"] > before
             press(page, "STOP")
             says(page, "STOPPED")
             says(page, f"process {session.pid} has stopped its arms")

@@ -14,10 +14,10 @@ import pytest
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.cli import main
 from marl_handover.config import TaskConfig
+from marl_handover.control.remote_control import SessionCommand
+from marl_handover.control.telemetry_reader import EVENTS_FILE, STATE_FILE, Reading, TelemetryReader
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.hardware.estop import StopLatch
-from marl_handover.runtime.feed import EVENTS_FILE, STATE_FILE, Feed, Reading
-from marl_handover.runtime.steering import Ask
 from marl_handover.task.rules import Command, Rules
 from marl_handover.viewer import live as live_words
 from marl_handover.viewer.live import LivePage, _picking
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("empty_session_registry")
 def session(twin_calibration, tmp_path_factory):
     """States and the picture of a whole episode, and its folder as it was left."""
     folder, stop = tmp_path_factory.mktemp("session") / "live", tmp_path_factory.mktemp("stop") / "stop"
-    states, ended, feed = [], threading.Event(), Feed(folder)
+    states, ended, feed = [], threading.Event(), TelemetryReader(folder)
 
     def collect():
         while not ended.wait(0.01):
@@ -51,7 +51,7 @@ def session(twin_calibration, tmp_path_factory):
 @pytest.fixture
 def page(server, tmp_path):
     """A page on an empty folder, and ``show(state)``, which publishes that as of now."""
-    page = LivePage(server, None, Feed(tmp_path))
+    page = LivePage(server, None, TelemetryReader(tmp_path))
 
     def show(state=None, **fields):
         here = {"pid": os.getpid(), "time": time.time(), "over": False, "stop_file": str(tmp_path / "stop")}
@@ -166,7 +166,7 @@ def test_the_log_keeps_its_tail(page, session, tmp_path):
 
 def test_a_page_opened_for_another_cell_shows_the_session_s(server, session, tmp_path):
     scene = CellScene(server, build_cell(cell_config("al5a")))
-    page = LivePage(server, scene, Feed(session.folder))
+    page = LivePage(server, scene, TelemetryReader(session.folder))
     page.update()
     assert page.scene is not scene
     assert page.scene.model.cell.config.name == "paper"
@@ -211,7 +211,7 @@ def test_events_without_sense_are_shown_as_they_are(page, session, tmp_path):
 def test_what_was_said_of_a_session_does_not_hold_for_the_next(page, session):
     state = session.states[-1]
     page.show_state(state)
-    page._ask(Ask.PAUSE)
+    page._ask(SessionCommand.PAUSE)
     page.stop()
     page.update()
     assert "only be stopped" in page._steering.content
@@ -225,7 +225,7 @@ def test_a_request_is_followed_until_the_session_has_taken_it(page, session, mon
     state = {**session.states[-1], "view_control": True}
     earlier = {"number": 1, "command": "pause", "goal": None, "refused": None}
     page.show_state(state, control=earlier)
-    page._ask(Ask.START)
+    page._ask(SessionCommand.START)
     page.update()
     assert "start: asked" in page._steering.content
     monkeypatch.setattr("marl_handover.viewer.live.MAX_AGE_S", 0.0)

@@ -9,11 +9,11 @@ from viewer_client import Client
 
 from marl_handover import policies
 from marl_handover.config import MotionConfig, NoiseConfig
+from marl_handover.control.closed_loop import ClosedLoop
+from marl_handover.control.transfers import transfer_row
 from marl_handover.envs.backends import NoisyBackend
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.runtime.loop import ClosedLoop
-from marl_handover.runtime.trace import transfer_row
 from marl_handover.viewer.server import address
 from marl_handover.viewer.trace import TracePage, moment_words
 from marl_handover.viewer.trace_file import Step, Trace, read_trace
@@ -122,7 +122,7 @@ def test_a_session_that_ends_as_nobody_is_to_move_is_not_told_to_have_had_too_ma
     backend = NoisyBackend(model, MotionConfig(), noise=NoiseConfig(), missed_grasps=0.0)
     [transfer] = ClosedLoop(Nobody(rules), MotionPlanner(model), backend).play(start, goal).transfers
     if not nobody:
-        transfer = replace(transfer, order=transfer.order._replace(place_mm=goal[:2]))
+        transfer = replace(transfer, command=transfer.command._replace(place_mm=goal[:2]))
     file = tmp_path / "trace.jsonl"
     file.write_text(json.dumps({"episode": 0, "step": 0, **transfer_row(transfer, rules)}) + "\n")
     trace = read_trace(file)

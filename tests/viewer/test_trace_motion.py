@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from marl_handover.cell.symmetry import LEFT
-from marl_handover.runtime.interactive.body import lying
+from marl_handover.control.interactive.world_state import lying
 from marl_handover.viewer.trace import Motions
 from marl_handover.viewer.trace_file import Recorded, Step
 

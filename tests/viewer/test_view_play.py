@@ -10,7 +10,7 @@ from viewer_client import Client
 from viser import _messages
 
 from marl_handover import policies
-from marl_handover.runtime.interactive.cell import InteractiveCell
+from marl_handover.control.interactive.cell import InteractiveCell
 from marl_handover.viewer.play import PlayPage
 from marl_handover.viewer.server import address, keep_updating
 from marl_handover.viewer.words import flat, plain
@@ -110,7 +110,7 @@ def looked_at(viewer, cell, times=25):
 def test_stop_freezes_everything_and_what_is_asked_for_before_it_is_cleared_is_not_done(viewer, cell, wish):
     viewer.set("STOP", True)
     viewer.wait(lambda: "STOPPED" in viewer.text(), SEEN_S)
-    frozen, goal, decider = cell.last, at(viewer, "/goal").copy(), cell._engine.decider
+    frozen, goal, adapter = cell.last, at(viewer, "/goal").copy(), cell._controller.adapter
     assert viewer.panel[viewer.input("clear the stop")]["disabled"] is False
     wish(viewer)
     looked_at(viewer, cell)
@@ -122,7 +122,7 @@ def test_stop_freezes_everything_and_what_is_asked_for_before_it_is_cleared_is_n
     for name in ("joints_rad", "T_world_block", "goal"):
         np.testing.assert_array_equal(getattr(cell.last, name), getattr(frozen, name))
     np.testing.assert_array_equal(at(viewer, "/goal"), goal)
-    assert cell._engine.decider is decider
+    assert cell._controller.adapter is adapter
     assert viewer.panel[viewer.input("policy")]["value"] == "exact"
     shown = viewer.panel[viewer.input("x, y [mm], turn [°]")]["value"]
     np.testing.assert_allclose(shown, (*frozen.goal[:2], math.degrees(frozen.goal[2])), atol=0.051)

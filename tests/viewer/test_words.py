@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marl_handover.runtime.interactive.cell import Placement, Snapshot
+from marl_handover.control.interactive.cell import Placement, Snapshot
 from marl_handover.viewer.words import decision_words, error_words, place_words, plain, score_words, state_words
 
 

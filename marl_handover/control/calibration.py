@@ -1,0 +1,183 @@
+"""``calibrate what=camera`` and ``what=grippers``: the camera's lens and place, and the pulses at which fingers hold the pin.
+
+The lens comes from a board that is held up, the camera's place from the same board on the table.
+
+Nobody sees from above to a tenth of a millimetre how far fingers are open, and a servo's zero that is a millimetre off eats up the whole
+preload, or presses as much too hard. So each hand is told to close a little further every time, from where it cannot touch the pin, until
+it carries the block; it is never closed further than it needs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marl_handover.cell import Cell
+from marl_handover.control.hardware_backend import BlockNotSeen, HardwareBackend
+from marl_handover.hardware.calibration import CalibrationProblem, shifted
+from marl_handover.hardware.clock import Clock
+from marl_handover.hardware.settings import ARMS, GripperConfig
+from marl_handover.motion.planner import MotionPlanner
+from marl_handover.perception.calibration import CameraCalibration, Pixels
+from marl_handover.perception.camera import Camera
+from marl_handover.perception.intrinsics import calibrate_lens
+from marl_handover.perception.plane import BoardOnTable, locate_by_board
+from marl_handover.perception.settings import BoardConfig
+from marl_handover.perception.sheets import Sheet, charuco_sheet
+
+PLACES = ((0.0, 0.0, 0.0), (-90.0, 20.0, math.pi / 2), (90.0, -20.0, -math.pi / 2))
+"""Where the board is laid, x_mm, y_mm, yaw_rad of its middle: between them they cover the shared part of the table."""
+
+VIEWS = 20
+_MARGIN_MM = 10.0
+_NEW_PICTURE_S = 0.1
+
+
+class Operator(Protocol):
+    """Somebody with hands: the twin, or a person who is told what to do."""
+
+    def hold_board(self, sheet: Sheet, number: int, count: int) -> None:
+        """Hold the board before the camera, slanted, every time elsewhere."""
+
+    def lay_board(self, sheet: Sheet, place: Sequence[float]) -> None:
+        """Lay it flat on the table at ``place`` (3,): x_mm, y_mm, yaw_rad."""
+
+    def take_board_away(self) -> None:
+        """Clear the table."""
+
+    def glue_cards(self) -> None:
+        """Fix the marker cards on the hands."""
+
+    def take_cards_off(self) -> None:
+        """Take them off again."""
+
+    def stand_block(self, place: Sequence[float]) -> None:
+        """Stand the block at ``place`` (3,): x_mm, y_mm, theta_rad."""
+
+
+def calibrate_camera(
+    camera: Camera, clock: Clock, board: BoardConfig, operator: Operator, name: str, views: int = VIEWS
+) -> CameraCalibration:
+    """The calibration of ``camera`` from ``views`` pictures of the board held up, and one at each of :data:`PLACES`.
+
+    Raises:
+        CalibrationFailed: the pictures do not give one.
+        StaleFrame: the camera gives no new pictures.
+    """
+    sheet = charuco_sheet(board, margin_mm=_MARGIN_MM)
+
+    def picture() -> Pixels:
+        clock.sleep_s(_NEW_PICTURE_S)
+        return camera.read().image
+
+    held = []
+    for number in range(views):
+        operator.hold_board(sheet, number, views)
+        held.append(picture())
+    lens = calibrate_lens(held, board)
+    laid = []
+    for place in PLACES:
+        operator.lay_board(sheet, place)
+        laid.append(BoardOnTable(picture(), *place))
+    operator.take_board_away()
+    return locate_by_board(lens, laid, board, name)
+
+
+Floats = NDArray[np.float64]
+
+RANGE_MM = 1.6
+"""How far the settings may be off, either way, for each finger."""
+
+STEP_MM = 0.2
+SURE_MM = 0.5
+"""So much further than where the block was first carried: that grip may have been a lucky one."""
+
+_ALPHA = 0.7
+"""Far apart: over a short way a hand lifts little, and fingers that are not closed drag the block along by its pin."""
+
+
+def places(cell: Cell) -> tuple[tuple[float, float, float], ...]:
+    """Between these, x_mm, y_mm, theta_rad, the block is carried; both arms of ``cell`` reach them."""
+    return tuple((float(x), float(y), 0.0) for x, y in cell.chart.to_table(np.array([-_ALPHA, _ALPHA]), np.zeros(2)))
+
+
+class Grip(NamedTuple):
+    """What came of a hand: its settings as they should be, how far they were off for each finger, and how often it tried."""
+
+    gripper: GripperConfig
+    off_mm: float
+    tries: int
+
+
+class GripperCalibration:
+    """Calibrates the hands of a cell whose camera and servos are calibrated.
+
+    Args:
+        backend: of the cell.
+        planner: of the arms' motions.
+        assistant: puts the block back when it has fallen.
+        progress: is told of each try: the arm, how far it closed beyond the settings in mm, whether it held.
+    """
+
+    def __init__(
+        self,
+        backend: HardwareBackend,
+        planner: MotionPlanner,
+        operator: Operator,
+        progress: Callable[[int, float, bool], object] = lambda arm, further_mm, held: None,
+    ) -> None:
+        self.backend, self.planner, self.operator, self.progress = backend, planner, operator, progress
+        self.places = places(backend.model.cell)
+
+    def arm(self, arm: int) -> Grip:
+        """Calibrate one hand; the cell goes on with what was found.
+
+        Raises:
+            CalibrationProblem: it never carried the block, or did so where it should not have touched it.
+            Stopped, DeviceError, BlockNotSeen: as :meth:`HardwareBackend.execute`.
+        """
+        wiring = self.backend.workcell.driver.config.arms[ARMS[arm]]
+        asked = self.backend.workcell.config.hardware.arms[ARMS[arm]].gripper
+        tries = np.arange(-RANGE_MM, RANGE_MM + STEP_MM / 2, STEP_MM)
+        for number, further_mm in enumerate(tries, start=1):
+            wiring.gripper = shifted(asked, float(further_mm))
+            held = self._carries(arm)
+            self.progress(arm, float(further_mm), held)
+            if held and number == 1:
+                raise CalibrationProblem(f"the {ARMS[arm]} gripper", self._words(asked, f"it holds the pin {RANGE_MM:g} mm too early"))
+            if held:
+                off_mm = float(further_mm) + SURE_MM
+                wiring.gripper = shifted(asked, off_mm)
+                return Grip(wiring.gripper, off_mm, number)
+        raise CalibrationProblem(f"the {ARMS[arm]} gripper", self._words(asked, f"it does not hold the pin, {RANGE_MM:g} mm further"))
+
+    def _words(self, asked: GripperConfig, what: str) -> str:
+        return (
+            f"{what} than the settings say (open_us={asked.open_us}, closed_us={asked.closed_us}, open_mm={asked.open_mm:g}): set them anew"
+        )
+
+    def _carries(self, arm: int) -> bool:
+        """Whether the hand, as it is set now, takes the block to the other place."""
+        pose = self._block()
+        place = max((np.asarray(place[:2]) for place in self.places), key=lambda place: math.dist(place, pose[:2]))
+        joints = self.backend.joints_rad()
+        motion = self.planner.plan_paths(arm, pose[:2], place, joints[arm], np.delete(joints, arm, axis=0))
+        refusal = self.backend.execute(arm, motion.paths).refusal
+        return refusal is None
+
+    def _block(self) -> Floats:
+        """Where the block stands; where nobody sees it, or an arm does not reach it, it is put back."""
+        try:
+            pose = self.backend.watch()
+        except BlockNotSeen as lost:
+            if not lost.camera_works:
+                raise
+            pose = None
+        if pose is not None and bool(self.backend.model.cell.reaches(pose[:2]).all()):
+            return pose
+        self.operator.stand_block(self.places[0])
+        return self.backend.reset(np.asarray(self.places[0]), 0)

@@ -1,0 +1,317 @@
+"""Playing problems with a policy and judging it: what ``evaluate`` prints and what ``compare`` collects."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_handover import policies
+from marl_handover.arrays import one_where, wrap
+from marl_handover.config import (
+    CellConfig,
+    LoopConfig,
+    MotionConfig,
+    TaskChanges,
+    bounded,
+    changed,
+    check_bounds,
+    chosen,
+    path_field,
+    seed_field,
+)
+from marl_handover.envs.centralised import CentralisedRules, MotionCommand
+from marl_handover.errors import InvalidSetting
+from marl_handover.hardware.settings import HardwareConfig
+from marl_handover.learning.evaluation import Evaluation, Trace, decision_time, evaluate, random_problems, read_problems
+from marl_handover.motion.path_length_table import known_table
+from marl_handover.policies import SupervisorPolicy
+from marl_handover.progress import Bar
+from marl_handover.task.episode import Decision, Episodes
+from marl_handover.task.planner import ExactPlanner
+from marl_handover.task.rules import Outcome, Rules
+
+if TYPE_CHECKING:
+    from marl_handover.control.closed_loop import ClosedLoop
+    from marl_handover.control.transfers import Episode, Transfer
+
+Floats = NDArray[np.float64]
+
+BACKENDS = ("kinematic", "noisy", "bullet", "twin")
+
+
+@dataclass
+class AssessmentConfig:
+    """Who is judged, where, on which problems. What is not given is the policy's own, or the default."""
+
+    policy: str = path_field("exact")  # exact, random, greedy, pretrained_a or _b or _twin, a run directory or a policy file
+    backend: str = chosen("kinematic", BACKENDS)  # kinematic; in closed loop with planned motions: noisy, bullet or twin
+    episodes: int = bounded(1000, 1, 10**6)  # random problems
+    seed: int = seed_field()  # of the problems, and of execution noise but for the twin, whose servos go on as they are
+    cell: CellConfig | None = None  # single keys change the paper cell
+    task: TaskChanges = field(default_factory=TaskChanges)  # task.noise left out: of noisy, 1 mm and 0.5 deg
+    grasp: str | None = chosen(None, ("friction", "constraint"))  # of bullet: friction or constraint; null: friction
+    missed_grasps: float | None = bounded(None, 0.0, 1.0)  # of noisy: probability that the fingers close on nothing; null: 0.01
+    loop: LoopConfig = field(default_factory=LoopConfig)  # of all but kinematic
+    motion: MotionConfig = field(default_factory=MotionConfig)  # of all but kinematic
+    calibration: str | None = path_field(None)  # of twin: folder of its calibration; null: runs/calibration/twin
+    hardware: HardwareConfig | None = None  # of twin: single keys change its electronics; ports are always the emulated ones
+    problems: str = path_field()  # JSON Lines of problems instead of random ones
+
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on what can be refused without playing."""
+        check_bounds(self)
+        backend_options(self)
+
+
+class Assessment(NamedTuple):
+    """What came of it.
+
+    ``report``: the content of ``evaluate json=FILE``; ``result``: each episode beside its optimum; ``trace_text``: makes the text of
+    ``trace=FILE``; ``rules``: what the episodes were judged by.
+    """
+
+    report: dict[str, Any]
+    result: Evaluation
+    trace_text: Callable[[], str]
+    rules: Rules
+
+
+def assess(config: AssessmentConfig, traced: bool = False, progress: bool = False) -> Assessment:
+    """Load the policy, play every problem, judge.
+
+    Args:
+        config: see there.
+        traced: keep what ``trace_text`` needs.
+        progress: show a bar.
+
+    Raises:
+        InvalidSetting, UnknownChoice, MissingFile, CorruptFile, CheckpointMismatch: on bad input.
+    """
+    config.validate()
+    policy = policies.adapted(config.policy, config.cell, config.seed, motion=config.motion, **vars(config.task))
+    play = _play_kinematic if config.backend == "kinematic" else _play_loop
+    result, trace_text, rules, added = play(config, policy, traced, progress)
+    report = {
+        "policy": config.policy,
+        "architecture": rules.config.architecture,
+        "variant": policy.variant,
+        "backend": config.backend,
+        "epsilon_deg": rules.config.epsilon_deg,
+        "symmetry_order": rules.config.symmetry_order,
+        "seed": config.seed,
+        **result.report(),
+        **added,
+    }
+    return Assessment(report, result, trace_text, rules)
+
+
+Played = tuple[Evaluation, Callable[[], str], Rules, dict[str, Any]]
+"""What came of the problems: the common figures, the text of the trace, the rules they were judged by, and the backend's own figures."""
+
+
+def _play_kinematic(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool, progress: bool) -> Played:
+    """All problems at once, on the batched rules."""
+    rules = policy.rules
+    problems, noise = _problems(config, rules), rules.config.noise
+    trace, paths = Trace(rules), PathLengths(rules)
+
+    def observer(decision: Decision) -> None:
+        paths(decision)
+        if traced:
+            trace(decision)
+
+    with _bar(problems, progress) as bar:
+        result = evaluate(rules, policy.act, problems, config.seed, observer, bar.update, policy.under(rules).act)
+    shown = {"noise": noise.report()} if rules.noisy or noise.observed else {}
+    return result, trace.text, rules, {**shown, **paths.report(), **_repaired(policy)}
+
+
+def _play_loop(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool, progress: bool) -> Played:
+    """One problem after the other, in closed loop."""
+    # Planner and simulator are imported where they are needed: the kinematic evaluation starts without them.
+    from marl_handover.control.closed_loop import make_loop
+    from marl_handover.control.transfers import trace_text
+    from marl_handover.envs.backends import NoisyBackend
+
+    started = time.perf_counter()
+    options = backend_options(config)
+    with make_loop(policy, config.backend, config.motion, config.loop, **options) as loop:
+        rules, backend = loop.rules, loop.backend
+        problems = _problems(config, rules)
+        with _bar(problems, progress) as bar:
+            played = play_problems(loop, problems, config.seed, bar.update)
+    outcomes, steps = (np.array(values) for values in zip(*((int(true_outcome(e, rules)), len(e.first)) for e in played), strict=True))
+    episodes = Episodes(outcomes, steps, np.stack([episode.first[-1].result.pose for episode in played]))
+    optimal = ExactPlanner(rules).plan(*problems).transfers
+    result = Evaluation(episodes, optimal, decision_time(loop.policy.under(rules).act, problems), time.perf_counter() - started)
+    own = (
+        {"noise": backend.noise.report(), "missed_grasps": backend.missed_grasps} if isinstance(backend, NoisyBackend) else _shown(options)
+    )
+    settings = {"chart_inset": rules.cell.config.chart_inset, "position_tolerance_mm": rules.config.position_tolerance_mm, **own}
+    return result, lambda: trace_text(played, rules), rules, {**loop_report(played, rules), **settings, **_repaired(loop.policy)}
+
+
+def _shown(options: dict[str, Any]) -> dict[str, Any]:
+    """Options as a report has them."""
+    return {name: asdict(value) if isinstance(value, HardwareConfig) else value for name, value in options.items()}
+
+
+def _repaired(policy: SupervisorPolicy) -> dict[str, Any]:
+    """Of a shielded policy: how many of its decisions the shield repaired."""
+    return {"repaired_decisions": policy.repaired} if isinstance(policy, policies.ShieldedPolicy) else {}
+
+
+def _problems(config: AssessmentConfig, rules: Rules) -> tuple[Floats, Floats]:
+    return read_problems(rules, Path(config.problems)) if config.problems else random_problems(rules, config.episodes, config.seed)
+
+
+def _bar(problems: tuple[Floats, Floats], progress: bool) -> Bar:
+    return Bar(total=len(problems[0]), unit="episode", shown=progress, leave=False)
+
+
+def backend_options(config: AssessmentConfig) -> dict[str, Any]:
+    """What was asked of the backend. Raises :class:`InvalidSetting` for what another one would take."""
+    if config.backend == "kinematic":
+        for key, value in changed("loop", config.loop) + changed("motion", config.motion):
+            raise InvalidSetting(key, value, "left out with backend=kinematic, which plans no motions; or backend=noisy or bullet")
+    owners = {"grasp": "bullet", "missed_grasps": "noisy", "calibration": "twin", "hardware": "twin"}
+    given = {name: getattr(config, name) for name in owners if getattr(config, name) is not None}
+    for name, value in given.items():
+        if owners[name] != config.backend:
+            raise InvalidSetting(name, value, f"left out, or backend={owners[name]}")
+    if config.backend in ("bullet", "twin") and config.task.noise is not None:
+        raise InvalidSetting("task.noise", asdict(config.task.noise), f"left out with backend={config.backend}, where physics decides")
+    if config.backend == "noisy" and config.task.noise is not None:
+        if config.task.noise.observed:
+            raise InvalidSetting("task.noise", asdict(config.task.noise), "without observed_mm and observed_deg, or backend=kinematic")
+        given["noise"] = config.task.noise  # as typed, also if that is none at all
+    return given
+
+
+def play_problems(
+    loop: ClosedLoop, problems: tuple[Floats, Floats], seed: int, progress: Callable[[int], object] = lambda result: None
+) -> list[Episode]:
+    """Play all problems, starts and goals (n, 3), in order; ``seed`` and the episode's number decide all that is random in it."""
+    episodes = []
+    for number, (start, goal) in enumerate(zip(*problems, strict=True)):
+        episode_seed = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
+        episodes.append(loop.play(start, goal, episode_seed))
+        progress(1)
+    return episodes
+
+
+def loop_report(episodes: Sequence[Episode], rules: Rules) -> dict[str, Any]:
+    """What the closed loop adds to ``evaluate json=FILE``; null where there is nothing to take it from.
+
+    Poses are the true ones where the backend knows them. ``position_error_mm`` and ``orientation_error_deg`` are of the first final
+    placements that were carried out; ``transfer_error_mm`` and ``transfer_error_deg`` of every single transfer, against what exact arms
+    would have done. Their ``bias`` is the mean error: in mm along and across (to the left of) the ray from the arm's base to the place; in
+    deg counter-clockwise.
+    """
+    every = [transfer for episode in episodes for transfer in episode.transfers]
+    carried = [transfer for transfer in every if transfer.result.refusal is None]
+    ends = [episode.first[-1] for episode in episodes if episode.first[-1].command.final and episode.first[-1].result.refusal is None]
+    away = [math.dist(transfer.result.true[:2], transfer.goal[:2]) for transfer in ends]
+    turned = [abs(math.degrees(rules.orientation_error(transfer.result.true[2], transfer.goal[2]))) for transfer in ends]
+    offsets, turns = _errors(carried, rules)
+    return {
+        "success_in_the_end": sum(truly_solved(episode, rules) for episode in episodes) / len(episodes),
+        "ended": dict(sorted(Counter(episode.ended for episode in episodes).items())),
+        "position_error_mm": _quantiles(away, 50, 99),
+        "orientation_error_deg": _quantiles(turned, 50, 99),
+        "refusals": dict(sorted(Counter(str(transfer.result.refusal) for transfer in every if transfer.result.refusal).items())),
+        "transfers": len(every),
+        "transfer_error_mm": {**_quantiles(np.hypot(*offsets.T), 50, 95), "bias": offsets.mean(0).tolist() if carried else None},
+        "transfer_error_deg": {**_quantiles(abs(turns), 50, 95), "bias": float(turns.mean()) if carried else None},
+        "planning_ms": _quantiles([transfer.result.planning_ms for transfer in carried], 50, 99),
+        "cycle_s": _quantiles([transfer.result.duration_s for transfer in carried], 50, 99),
+        "episode_s": _quantiles([episode.wall_s for episode in episodes], 50, 99),
+    }
+
+
+def true_outcome(episode: Episode, rules: Rules) -> Outcome:
+    """The first verdict, by where the object truly was then; where nobody knows better than the loop, the loop's own."""
+    last = episode.first[-1]
+    if last.result.truth is None or last.truncated or not last.result.tried:
+        return episode.outcome
+    if rules.external_finish:
+        return Outcome(int(rules.external_verdict(last.result.truth, last.goal, np.int64(last.command.arm)).outcome))
+    return Outcome(int(rules.judge(last.result.truth, last.goal, np.bool_(last.command.final), np.bool_(True)).outcome))
+
+
+def truly_solved(episode: Episode, rules: Rules) -> bool:
+    """Whether the loop ended with the object at the goal, and it truly was there."""
+    last = episode.transfers[-1]
+    if last.result.truth is None or not episode.solved:
+        return episode.solved
+    verdict = rules.external_verdict(last.result.truth, last.goal, np.int64(last.command.arm))
+    return int(verdict.outcome) == Outcome.SUCCESS
+
+
+def _errors(transfers: Sequence[Transfer], rules: Rules) -> tuple[Floats, Floats]:
+    """Of each transfer: the offset (n, 2) in mm along and across the arm's ray, and the turn (n,) in deg, from what was predicted."""
+    if not transfers:
+        return np.zeros((0, 2)), np.zeros(0)
+    arms = np.array([transfer.command.arm for transfer in transfers])
+    reached = np.stack([transfer.result.true for transfer in transfers])
+    predicted = np.stack([transfer.command.predicted for transfer in transfers])
+    bases = np.array([base.position_mm for base in rules.cell.bases])[arms]
+    ray = predicted[:, :2] - bases
+    ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    left = np.stack([-ray[:, 1], ray[:, 0]], -1)
+    offset = reached[:, :2] - predicted[:, :2]
+    along, across = (offset * ray).sum(-1), (offset * left).sum(-1)
+    return np.stack([along, across], -1), np.degrees(wrap(reached[:, 2] - predicted[:, 2]))
+
+
+def _quantiles(values: ArrayLike, *percents: int) -> dict[str, float | None]:
+    """``{"p50": ...}``; null of nothing."""
+    array = np.asarray(values, float)
+    if not array.size:
+        return {f"p{percent}": None for percent in percents}
+    return {f"p{percent}": float(np.percentile(array, percent)) for percent in percents}
+
+
+CHUNK = 2000
+
+
+class PathLengths:
+    """An observer of roll-outs that remembers every commanded transfer that was carried out.
+
+    The executors' lengths come from :mod:`marl_handover.motion.path_length_table`, 0.1 mm off in the median, for cells that have a
+    table; nothing is computed for others. Architecture A's external transfers are not counted.
+    """
+
+    def __init__(self, rules: Rules) -> None:
+        self.rules = rules
+        self.table = known_table(rules.cell, MotionConfig())
+        self._ways: list[tuple[NDArray[Any], ...]] = []
+
+    def __call__(self, decision: Decision) -> None:
+        """Take in one decision of the running episodes."""
+        result, command = decision.result.feasible, decision.result.command
+        to = one_where(command.final, decision.goal[..., :2], command.place_mm)
+        motion = command.motion if isinstance(command, MotionCommand) else np.zeros((len(to), 0))
+        self._ways.append(tuple(part[result] for part in (command.arm, decision.pose[..., :2], to, motion)))
+
+    def report(self) -> dict[str, float]:
+        """``path_mm``: mean length of a transfer; ``executor_path_mm``: what executors would travel on the same ways."""
+        if self.table is None or not self._ways:
+            return {}
+        arm, start, end, motion = (np.concatenate(parts) for parts in zip(*self._ways, strict=True))
+        if not len(arm):
+            return {}
+        executors = self.table(self.rules.cell, arm, start, end)
+        if not isinstance(self.rules, CentralisedRules):
+            return {"path_mm": float(executors.mean()), "executor_path_mm": float(executors.mean())}
+        chunks = (slice(first, first + CHUNK) for first in range(0, len(arm), CHUNK))
+        own = np.concatenate([self.rules.path_mm(arm[rows], start[rows], end[rows], motion[rows]) for rows in chunks])
+        return {"path_mm": float(own.mean()), "executor_path_mm": float(executors.mean())}

@@ -1,0 +1,282 @@
+"""The interactive cell: goal or block may be changed at any time, in mid-motion too, and the arms re-plan at once.
+
+A cell of exact, kinematic arms in simulated time, for a person to play with. Wishes may come from any thread, and so may calls of
+:meth:`InteractiveCell.advance`, which take turns. What is wished last is done; what was planned for an older wish is dropped.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_handover.arrays import wrap
+from marl_handover.cell.build import CellModel
+from marl_handover.config import MotionConfig, require_at_least, require_seed
+from marl_handover.control.interactive.controller import InteractiveController
+from marl_handover.control.interactive.policy_adapter import Placement, PolicyAdapter
+from marl_handover.control.interactive.world_state import projected
+from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach
+from marl_handover.motion.planner import MotionPlanner
+from marl_handover.policies import SupervisorPolicy
+
+__all__ = ["InteractiveCell", "Placement", "Snapshot"]
+
+Floats = NDArray[np.float64]
+
+NEXT = -1
+"""Instead of a problem's seed."""
+
+
+class Snapshot(NamedTuple):
+    """The cell at one moment.
+
+    Attributes:
+        t_s: simulated time.
+        joints_rad: (num_arms, 5).
+        grip_open: of each arm.
+        T_world_block: (4, 4) in mm, of the middle of the block's underside, x along its yaw.
+        block: (3,) x_mm, y_mm, yaw_rad of the block seen from above, also while it is carried.
+        goal: (3,).
+        state: waiting, moving, paused, stopped, done or stuck.
+        arm: the moving arm, -1 for none.
+        phase: approach, grasp, lift, transfer, lower, release, retreat; "" if nothing moves.
+        plan: the placements to come, by the policy's own rollout on the rule book.
+        transfers: carried out since the episode began or was changed last.
+        optimal: the fewest from there; 0 if none was needed, or there is no plan.
+        episodes, solved: that have ended, and with the block at the goal.
+        ratio: mean of transfers over optimum of solved episodes; nan at first.
+        message: the last event, refusal or error, one line.
+    """
+
+    t_s: float
+    joints_rad: Floats
+    grip_open: tuple[bool, ...]
+    T_world_block: Floats
+    block: Floats
+    goal: Floats
+    state: str
+    arm: int
+    phase: str
+    plan: tuple[Placement, ...]
+    transfers: int
+    optimal: int
+    episodes: int
+    solved: int
+    ratio: float
+    message: str
+
+
+@dataclass(frozen=True)
+class _Wishes:
+    """What was wished since the last look; of each kind, the newest."""
+
+    goal: Floats | None = None
+    block: Floats | None = None
+    adapter: PolicyAdapter | None = None
+    problem: int | None = None
+    since: float = math.nan
+
+
+class InteractiveCell:
+    """Two exact arms, a block and a goal to play with.
+
+    An arm whose hand is empty brakes and goes for what is decided now. A block in the hand keeps its orientation to the hand, so the
+    decision is made from where it was picked up: if it names the same arm, the hand turns to the new place in mid-air; else the block is
+    put down where it was going, or back where it came from if that leaves fewer transfers. A block dragged out of the hand is taken from
+    it. A block dragged to where an arm is, or cannot be kept off, stays where it was.
+
+    While paused or stopped, simulated time stands still. A stop is latched: :meth:`resume` does nothing until :meth:`clear`, after
+    which the cell is paused; clearing alone moves nothing. What is wished before the clear, and was not begun at the stop, is dropped.
+
+    Args:
+        policy: the supervisor.
+        model: its cell.
+        motion: how the arms move.
+        seed: of the problems; the first one is there at once.
+
+    Raises:
+        InvalidSetting: of a policy for another cell, or whose motions are its own; of a setting out of its limits.
+    """
+
+    def __init__(self, policy: SupervisorPolicy, model: CellModel, motion: MotionConfig | None = None, seed: int = 0) -> None:
+        require_seed(seed)
+        self.model, self.motion = model, motion or MotionConfig()
+        planner = MotionPlanner(model, self.motion)
+        planner.warm_up()
+        self._controller = InteractiveController(PolicyAdapter(policy, model, self.motion), model, planner, seed)
+        self._lock, self._advancing = threading.Lock(), threading.Lock()
+        self._wishes, self._paused, self._stopped = _Wishes(), False, False
+        self.stops = 0
+        """How often it was stopped."""
+        self._t_s, self._since = 0.0, math.nan
+        self.last_replan_ms = math.nan
+        """From the last wish that changed a motion to the first sample of the new one, wall time; nan at first."""
+
+    def set_goal(self, pose: ArrayLike) -> bool:
+        """The goal is at ``pose`` (3,): x_mm, y_mm, yaw_rad.
+
+        Returns:
+            Whether it is taken up: not while stopped.
+
+        Raises:
+            OutOfReach, NotFinite, InvalidSetting: of the pose.
+        """
+        return self._wish(goal=self._checked("goal", pose))
+
+    def set_block(self, pose: ArrayLike) -> bool:
+        """The block lies at ``pose`` (3,), also if a hand holds it now. Returns and raises as :meth:`set_goal`."""
+        return self._wish(block=self._checked("block", pose))
+
+    def set_policy(self, policy: SupervisorPolicy) -> bool:
+        """Another supervisor. Returns as :meth:`set_goal`; raises :class:`InvalidSetting` as the constructor does."""
+        return self._wish(adapter=PolicyAdapter(policy, self.model, self.motion))
+
+    def new_problem(self, seed: int | None = None) -> bool:
+        """A random block and goal: those of ``seed``, else the next ones. An episode under way is given up, and not counted.
+
+        Returns as :meth:`set_goal`.
+        """
+        if seed is not None:
+            require_seed(seed)
+        return self._wish(problem=NEXT if seed is None else seed, goal=None, block=None)
+
+    def pause(self) -> None:
+        """Time stands still."""
+        with self._lock:
+            self._paused = True
+
+    def resume(self) -> None:
+        """Time goes on, unless stopped."""
+        with self._lock:
+            self._paused = self._paused and self._stopped
+
+    def toggle(self) -> None:
+        """Pause, or resume if it is paused: as things are now, whatever was shown last."""
+        with self._lock:
+            self._paused = not self._paused or self._stopped
+
+    def stop(self) -> None:
+        """No arm moves any more when this returns, until :meth:`clear` and then :meth:`resume`."""
+        with self._lock:
+            self._stopped = self._paused = True
+            self._wishes = _Wishes()
+            self.stops += 1
+
+    def clear(self) -> None:
+        """Take the stop back; the cell is paused then."""
+        with self._lock:
+            self._stopped = False
+
+    def advance(self, dt_s: float) -> Snapshot:
+        """Let ``dt_s`` of simulated time pass. It takes no longer than to decide once and to plan a path or two.
+
+        Raises:
+            InvalidSetting: time does not go back.
+        """
+        require_at_least("dt_s", dt_s, 0)
+        with self._advancing:
+            return self._advance(dt_s)
+
+    def _advance(self, dt_s: float) -> Snapshot:
+        with self._lock:
+            wishes, self._wishes = self._wishes, _Wishes()
+        replanned = not math.isnan(wishes.since)
+        if replanned:
+            self._take(wishes)
+        else:
+            self._controller.prepare()
+        left = self._step(dt_s, dt_s)
+        if not replanned and self._idle():
+            self._controller.proceed()
+            self._controller.prepare()
+            self._step(left, 0.0)
+        if self._paused:
+            self._since = math.nan  # nothing to be measured: the motion waits for the user
+        elif not math.isnan(self._since) and self._controller.moving:
+            self.last_replan_ms, self._since = 1e3 * (time.perf_counter() - self._since), math.nan
+        return self._snapshot()
+
+    def _take(self, wishes: _Wishes) -> None:
+        """Do what was wished."""
+        controller = self._controller
+        changed = block_moved = False
+        if wishes.adapter is not None:
+            controller.adapter, changed = wishes.adapter, True
+        if wishes.problem is not None and controller.pose_problem(None if wishes.problem == NEXT else wishes.problem):
+            changed = block_moved = True
+        if wishes.goal is not None:
+            controller.goal, changed = wishes.goal, True
+        if wishes.block is not None and controller.put(wishes.block):
+            changed = block_moved = True
+        if changed:
+            controller.replan(block_moved)
+            self._since = wishes.since
+
+    def _step(self, dt_s: float, passed_s: float) -> float:
+        """Move for ``dt_s`` while ``passed_s`` pass, if time does pass; what is left of ``dt_s`` when nothing moves any more."""
+        with self._lock:
+            if self._paused:
+                return 0.0
+            self._t_s += passed_s
+            return self._controller.step(dt_s)
+
+    def _idle(self) -> bool:
+        return not (self._paused or self._controller.moving or self._controller.ended)
+
+    def _wish(self, **wish: object) -> bool:
+        with self._lock:
+            if not self._stopped:
+                self._wishes = replace(self._wishes, since=time.perf_counter(), **wish)  # type: ignore[arg-type]
+            return not self._stopped
+
+    def _checked(self, what: str, pose: ArrayLike) -> Floats:
+        """A pose (3,) that an arm reaches, its yaw wrapped."""
+        array = np.array(pose, float)
+        if array.shape != (3,):
+            raise InvalidSetting(what, np.shape(pose), "three numbers: x_mm, y_mm, yaw_rad")
+        if not np.isfinite(array).all():
+            raise NotFinite(what, array.tolist())
+        cell = self.model.cell
+        with np.errstate(over="ignore"):
+            reached = bool(cell.reaches(array).any())
+        if not reached:
+            raise OutOfReach(what, (float(array[0]), float(array[1])), cell.r_min_mm, cell.r_max_mm)
+        array[2] = wrap(array[2])
+        return array
+
+    def _snapshot(self) -> Snapshot:
+        controller, world = self._controller, self._controller.world
+        T_world_block = world.T_world_block()
+        return Snapshot(
+            self._t_s,
+            world.joints_rad.copy(),
+            tuple(bool(opened > 0.5) for opened in world.opened),
+            T_world_block,
+            projected(T_world_block),
+            controller.goal.copy(),
+            self._state(),
+            world.arm,
+            world.phase(),
+            controller.plan,
+            controller.transfers,
+            controller.optimal,
+            controller.score.episodes,
+            controller.score.solved,
+            controller.score.ratio,
+            controller.message,
+        )
+
+    def _state(self) -> str:
+        if self._stopped:
+            return "stopped"
+        if self._paused:
+            return "paused"
+        if self._controller.moving:
+            return "moving"
+        return self._controller.ended or "waiting"

@@ -1,0 +1,190 @@
+"""The twin of a cell: emulated boards and servos behind a serial port, physics that follows them, a rendered camera; one virtual clock.
+
+What stands above it - driver, gate, detector, loop - is the code that runs the real cell, byte for byte and pixel for pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from marl_handover.cell.build import CellModel
+from marl_handover.config import MotionConfig
+from marl_handover.control.settings import WorkcellConfig
+from marl_handover.geometry.se3 import flat_pose, transform
+from marl_handover.hardware.clock import VirtualClock
+from marl_handover.hardware.emulator.device import EmulatedCell, Fault
+from marl_handover.perception.calibration import Pixels, hung_camera
+from marl_handover.perception.camera import Frame, RenderedCamera
+from marl_handover.perception.scene import CellPainter, held_boards
+from marl_handover.perception.sheets import Sheet, marker_sheet
+from marl_handover.simulation.arm import SERVO_S
+from marl_handover.simulation.follower import ServoFollower, ServoState
+from marl_handover.simulation.world import BulletCell
+
+Floats = NDArray[np.float64]
+
+_BOOTED_S = 1.0
+_HAND_STEP_S, _HAND_S = 0.02, 1.0
+_LIFTED_MM, _LEANING_RAD = 3.0, math.radians(3.0)
+_EDGE_MM = 1e4
+
+
+class Twin:
+    """A cell that exists only here.
+
+    Args:
+        model: the cell.
+        motion: the parked pose, in which the arms stand at first.
+        config: servos, camera, people.
+    """
+
+    def __init__(self, model: CellModel, motion: MotionConfig, config: WorkcellConfig) -> None:
+        self.model, self.motion, self.config = model, motion, config
+        self._random = np.random.default_rng(config.twin.seed)
+        self.clock = VirtualClock()
+        self._parked = np.radians(motion.parked_deg)
+        self.electronics = EmulatedCell(config.hardware, model.arm, self._parked, motion.finger_travel_mm)
+        ports = self.electronics.mount(self.clock)
+        self.hardware = replace(
+            config.hardware,
+            boards={name: replace(board, port=ports.get(name, board.port), scan=False) for name, board in config.hardware.boards.items()},
+        )
+        """The electronics' settings, their ports those of the emulated boards."""
+        self.cell = BulletCell(model, motion)
+        self.follower = ServoFollower(self.cell, self._servos)
+        truth = hung_camera(config.mount, (config.camera.width_px, config.camera.height_px))
+        self.painter = CellPainter(model, truth, config.target, config.look, config.twin.seed)
+        self.camera = RenderedCamera(self._picture, config.camera.max_age_s, self.clock.now_s)
+        self.goal: Floats | None = None
+        """Where a printed goal lies (3,); None: there is none."""
+        self.hidden_until_s = self.frozen_until_s = -1.0
+        """Until when a hand covers the block, and until when the camera gives its last picture again."""
+        self._sheets: list[tuple[Sheet, Floats]] = []
+        self._cards: list[tuple[Sheet, Floats]] = []
+        self._last: Pixels | None = None
+        self._number = 0
+        self.clock.at(SERVO_S, self._tick)
+        self.clock.until(_BOOTED_S)
+
+    def close(self) -> None:
+        """Let the physics go; again is fine."""
+        self.cell.close()
+
+    def true_pose(self) -> Floats:
+        """Where the block is (3,): x_mm, y_mm, theta_rad."""
+        return self.cell.object_pose()
+
+    def true_joints_rad(self) -> Floats:
+        """Where the joints are (num_arms, 5)."""
+        return self.cell.joints_rad()
+
+    def set_object_pose(self, pose: ArrayLike) -> None:
+        """Somebody puts the block at ``pose`` (3,), standing."""
+        self.cell.block.place(np.asarray(pose, float))
+        self.follower.disturbed()
+
+    def hide(self, duration_s: float) -> None:
+        """Somebody holds a hand over the block."""
+        self.hidden_until_s = self.clock.now_s() + duration_s
+
+    def freeze(self, duration_s: float) -> None:
+        """The camera gives its last picture again and again."""
+        self.frozen_until_s = self.clock.now_s() + duration_s
+
+    def add_faults(self, faults: Sequence[Fault]) -> None:
+        """Faults of the electronics, on every board; times are the clock's."""
+        for device in self.electronics.devices.values():
+            device.add_faults(faults)
+
+    def confirm(self, question: str) -> bool:
+        """The twin's operator: does what is asked, and says so.
+
+        Whoever is asked whether the arms stand parked puts them there: opens the hand, sets the block down, turns the joints by hand. While
+        the boards hold the arms there is nothing to do.
+        """
+        now_s = self.clock.now_s()
+        if any(any(device.outputs_us(now_s)) for device in self.electronics.devices.values()):
+            return True
+        if np.abs(self.electronics.joints_rad(now_s) - self._parked).max() > math.radians(2.0):
+            self._tidy_up()
+        return True
+
+    def hold_board(self, sheet: Sheet, number: int, count: int) -> None:
+        """Somebody holds the calibration board before the camera, for the ``number``-th of ``count`` times."""
+        poses = held_boards(self.painter.renderer.calibration, count, self.config.twin.seed)
+        self._sheets = [(sheet, poses[number])]
+
+    def lay_board(self, sheet: Sheet, place: Sequence[float]) -> None:
+        """Somebody lays the board onto its marks at ``place`` (3,): x_mm, y_mm, yaw_rad; as exactly as people do."""
+        people = self.config.twin
+        off = self._random.normal(size=3) * (people.board_sd_mm, people.board_sd_mm, math.radians(people.board_sd_deg))
+        self._sheets = [(sheet, flat_pose(*(np.asarray(place) + off)))]
+
+    def take_board_away(self) -> None:
+        """The table is free."""
+        self._sheets = []
+
+    def glue_cards(self) -> None:
+        """Somebody glues the marker cards onto the hands, as exactly as people do."""
+        cards, people = self.config.hand_markers, self.config.twin
+        self._cards = []
+        for number in cards.ids:
+            off = self._random.normal(size=3) * (people.card_sd_mm, people.card_sd_mm, math.radians(people.card_sd_deg))
+            place = np.asarray(cards.place_mm) + (off[0], off[1], 0.0)
+            sheet = marker_sheet(self.config.target.dictionary, number, cards.marker_mm, cards.marker_mm * 4 / 3)
+            self._cards.append((sheet, transform(tuple(place), (0.0, 0.0, float(off[2])))))
+
+    def take_cards_off(self) -> None:
+        """The hands are free."""
+        self._cards = []
+
+    def stand_block(self, place: Sequence[float]) -> None:
+        """Somebody stands the block at ``place`` (3,): x_mm, y_mm, theta_rad."""
+        self.set_object_pose(place)
+
+    def _servos(self, t_s: float) -> ServoState:
+        return ServoState(self.electronics.joints_rad(t_s), self.electronics.gripper_mm(t_s))
+
+    def _tick(self) -> None:
+        now_s = self.clock.now_s()
+        self.follower.advance(now_s)
+        self.clock.at(now_s + SERVO_S, self._tick)
+
+    def _picture(self) -> Frame:
+        now_s = self.clock.now_s()
+        self._number += 1
+        if self._last is None or now_s >= self.frozen_until_s:
+            self._last = self._painted(now_s)
+        return Frame(self._last, now_s, self._number)
+
+    def _painted(self, now_s: float) -> Pixels:
+        joints = self.true_joints_rad()
+        fingers = [arm.gripper_mm() for arm in self.cell.arms]
+        sheets = list(self._sheets)
+        for base, q, (card, T_grip_card) in zip(self.model.cell.bases, joints, self._cards, strict=False):
+            sheets.append((card, base.matrix() @ self.model.arm.fk(q) @ T_grip_card))
+        block = None if now_s < self.hidden_until_s or self._sheets else self.cell.block.transform()
+        return self.painter.picture(block, joints, self.goal, fingers, sheets)
+
+    def _tidy_up(self) -> None:
+        """Open the hands, set the block down, turn the arms to the parked pose: raised first, then the rest."""
+        arms = range(self.model.cell.num_arms)
+        for arm in arms:
+            self.electronics.servos(arm)[-1].put(self.motion.finger_travel_mm)
+        self.clock.sleep_s(_HAND_S)
+        pose = self.true_pose()
+        if self.cell.block.height_mm() > _LIFTED_MM or self.cell.tilt_rad() > _LEANING_RAD or not self.model.cell.reaches(pose[:2]).any():
+            self.set_object_pose(self.model.cell.clamp_to_workspace(pose, _EDGE_MM))
+        start = self.electronics.joints_rad(self.clock.now_s())
+        raised = start.copy()
+        raised[:, 1] = self._parked[1]
+        for begin, end in ((start, raised), (raised, np.tile(self._parked, (len(start), 1)))):
+            for share in np.arange(_HAND_STEP_S, _HAND_S + 1e-9, _HAND_STEP_S) / _HAND_S:
+                for arm in arms:
+                    self.electronics.put(arm, begin[arm] + share * (end[arm] - begin[arm]), self.clock.now_s())
+                self.clock.sleep_s(_HAND_STEP_S)
