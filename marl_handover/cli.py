@@ -85,7 +85,7 @@ def _guarded(name: str, arguments: list[str]) -> int:
     speaker, debug = f"{PROGRAM} {name}", False
     try:
         debug, arguments = _take_debug(arguments)
-        arguments = _take_plugins(arguments)
+        arguments = take_plugins(arguments)
         status = _dispatch(name, arguments)
         sys.stdout.flush()  # here, so that a closed pipe shows itself inside this try
         return status
@@ -157,7 +157,7 @@ def _take_debug(arguments: list[str]) -> tuple[bool, list[str]]:
     return debug, rest
 
 
-def _take_plugins(arguments: list[str]) -> list[str]:
+def take_plugins(arguments: list[str]) -> list[str]:
     """``plugins=FILE.py`` is a key of every command too: these files are loaded before any other key is read."""
     paths = [argument.partition("=")[2] for argument in arguments if argument.startswith("plugins=")]
     if paths:

@@ -31,7 +31,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from marl_handover.cli import COMMANDS, PROGRAM, main
+from marl_handover.cli import COMMANDS, PROGRAM, main, take_plugins
 from marl_handover.compose import compose
 from marl_handover.errors import HandoverError, UnknownKey
 
@@ -126,7 +126,7 @@ def check_line(words: list[str]) -> None:
     """Raise unless the command exists and takes its keys and values."""
     command, *arguments = words[1:]
     module = importlib.import_module(COMMANDS[command].module)
-    given = [argument for argument in arguments if argument != "--help" and not argument.startswith("debug=")]
+    given = [argument for argument in take_plugins(arguments) if argument != "--help" and not argument.startswith("debug=")]
     assert isinstance(compose(module.SCHEMA, given, groups=module.GROUPS, aliases=module.ALIASES), module.SCHEMA)
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from marl_handover.learning.trainer import Trainer
 
 SCHEMA = TrainConfig
-ALIASES = {"architecture": "task.architecture", "epsilon_deg": "task.epsilon_deg"}
+ALIASES = {"architecture": "task.architecture"}
 GROUPS = {"algorithm": ALGORITHMS}
 FREE_ON_RESUME = ("resume", "out", "progress")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from marl_handover.config import EPSILON_DEG, bounded
@@ -31,6 +31,16 @@ def wide_first() -> list[StageConfig]:
     """
     wide = [StageConfig(8.0, 15.0, until_step=8_000), StageConfig(3.0, 12.0, until_step=12_000)]
     return [*wide, StageConfig(1.5, 12.0, until_step=16_000), StageConfig(0.7, 12.0)]
+
+
+def down_to(epsilon_deg: float, stages: Sequence[StageConfig]) -> list[StageConfig]:
+    """The same stages for one accuracy: the last one goes down to it, and none goes below.
+
+    The wider epsilons stay: at a small one alone nearly nothing is solved, so nearly nothing is learned.
+    """
+    lows = [*(max(stage.epsilon_low_deg, epsilon_deg) for stage in stages[:-1]), epsilon_deg]
+    highs = (max(stage.epsilon_high_deg, epsilon_deg) for stage in stages)
+    return [replace(stage, epsilon_low_deg=low, epsilon_high_deg=high) for stage, low, high in zip(stages, lows, highs, strict=True)]
 
 
 class Curriculum:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from marl_handover.config import (
+    EPSILON_DEG,
     EXPLORATIONS,
     HINDSIGHT,
     LAYOUTS,
@@ -26,7 +27,7 @@ from marl_handover.config import (
     sized,
 )
 from marl_handover.errors import InvalidSetting
-from marl_handover.learning.curriculum import StageConfig, wide_first
+from marl_handover.learning.curriculum import StageConfig, down_to, wide_first
 from marl_handover.plugins import Registry
 
 
@@ -148,6 +149,7 @@ class TrainConfig:
     task: TaskConfig = field(default_factory=TaskConfig)
     algorithm: AlgorithmConfig = field(default_factory=SacConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
+    epsilon_deg: float | None = bounded(None, *EPSILON_DEG)  # train down to this accuracy and validate at it; null: as the stages have it
     curriculum: list[StageConfig] = sized(wide_first, 1, 100)
     variant: str = chosen("hierarchical", tuple(VARIANTS))  # hierarchical, centralised or decentralised
     centralised: CentralisedConfig = field(default_factory=CentralisedConfig)
@@ -173,6 +175,11 @@ class TrainConfig:
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
         check_bounds(self)
+        if self.epsilon_deg is not None:
+            if self.task.epsilon_deg not in (TaskConfig().epsilon_deg, self.epsilon_deg):
+                raise InvalidSetting("task.epsilon_deg", self.task.epsilon_deg, f"left out, or epsilon_deg = {self.epsilon_deg:g}")
+            self.task.epsilon_deg = self.epsilon_deg
+            self.curriculum = down_to(self.epsilon_deg, self.curriculum)
         if self.task.layout not in (TaskConfig().layout, self.algorithm.layout):
             raise InvalidSetting("task.layout", self.task.layout, "left alone in training; the learner's layout is algorithm.layout")
         self.task.layout = self.algorithm.layout

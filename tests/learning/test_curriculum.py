@@ -7,6 +7,7 @@ import math
 import pytest
 
 from marl_handover.envs.supervisor_env import SupervisorEnv
+from marl_handover.errors import InvalidSetting
 from marl_handover.learning.curriculum import Curriculum
 from marl_handover.learning.settings import StageConfig
 from marl_handover.learning.trainer import Trainer
@@ -57,6 +58,36 @@ def test_training_goes_through_its_stages(small, table, tmp_path):
     rows = [(int(row["step"]), round(float(row["epsilon_low_deg"]), 3)) for row in table(tmp_path)]
     expected = [(step, 40 if step <= 256 else 20 if step <= 512 else 10) for step in range(128, 769, 128)]
     assert rows == expected
+
+
+def test_the_accuracy_that_training_is_asked_for_reaches_its_rewards(small, table, tmp_path):
+    """The last stage goes down to it, no stage goes below, and validation judges at it."""
+    config = small("sac", "epsilon_deg=9")
+    config.validate()
+    ranges = [(stage.epsilon_low_deg, stage.epsilon_high_deg) for stage in config.curriculum]
+    assert ranges == [(9.0, 15.0), (9.0, 12.0), (9.0, 12.0), (9.0, 12.0)]
+    config = small("sac", "epsilon_deg=0.5")
+    config.validate()
+    assert (config.curriculum[-1].epsilon_low_deg, config.curriculum[-1].epsilon_high_deg) == (0.5, 12.0)
+    trainer = Trainer(small("sac", "epsilon_deg=9", "curriculum=[{until_step:256},{}]", "evaluation_interval=256", "steps=512"), tmp_path)
+    assert trainer.rules.epsilon_rad == pytest.approx(math.radians(9))
+    trainer.run()
+    assert {float(row[f"epsilon_{end}_deg"]) for row in table(tmp_path) for end in ("low", "high")} == {9.0}
+    batch = trainer.replay.sample(2000)
+    assert batch["epsilon"].unique().tolist() == pytest.approx([math.radians(9)])
+    turned = (batch["next", "achieved_goal"] - batch["desired_goal"])[:, 2].abs()
+    near = batch["final"][:, 0] & (batch["next", "reward"][:, 0] > 0)
+    assert math.radians(5) < turned[near].max() <= math.radians(9)
+
+
+def test_asking_twice_asks_for_the_same(small):
+    config = small("sac", "epsilon_deg=3")
+    config.validate()
+    stages = config.curriculum
+    config.validate()
+    assert config.curriculum == stages
+    with pytest.raises(InvalidSetting, match=r"task\.epsilon_deg = 2"):
+        small("sac", "epsilon_deg=3", "task.epsilon_deg=2").validate()
 
 
 def test_without_the_last_stage_the_latest_actor_is_kept(small, tmp_path):
