@@ -22,6 +22,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import numpy as np
 from common import ROOT, commit, machine, parse, table
+from continuous_collision import certify
 from motion_peers import against_ompl, against_paper, against_toppra, arguments, spread, timed
 from tqdm import tqdm
 from transfers import FILE, read
@@ -30,7 +31,6 @@ from marl_handover.cell.build import build_cell, cell_config
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.commands.plan import solve
 from marl_handover.learning.evaluation import random_problems
-from marl_handover.motion.continuous_collision import certify
 from marl_handover.motion.coordination import coordinate
 from marl_handover.motion.path_length_table import path_length_table
 from marl_handover.motion.path_optimizer import FoundPath, NoPath

@@ -9,10 +9,10 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+from ompl_planner import STEP_RAD, OmplMissing, rrt_connect
 from scipy.interpolate import BSpline
 
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.motion.ompl_planner import STEP_RAD, OmplMissing, rrt_connect
 from marl_handover.motion.path_optimizer import FoundPath, NoPath, Segment
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.slsqp_planner import plan_slsqp

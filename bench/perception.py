@@ -31,9 +31,8 @@ from marl_handover.cell.build import CellModel, build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.control.settings import TwinConfig
 from marl_handover.geometry.se3 import flat_pose
-from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels, hung_camera
+from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels, calibrate_lens, hung_camera
 from marl_handover.perception.detector import Detector
-from marl_handover.perception.intrinsics import calibrate_lens
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.perception.settings import BoardConfig, LookConfig, MountConfig

@@ -28,9 +28,8 @@ from common import parse
 from tqdm import tqdm
 
 from marl_handover.cell.build import build_cell, cell_config
-from marl_handover.motion.augmented_lagrangian import SolverOptions
 from marl_handover.motion.initial_guesses import carrying_guesses, fit_control_points, random_bend
-from marl_handover.motion.path_optimizer import NoPath, require_free_ends, solve_from
+from marl_handover.motion.path_optimizer import NoPath, SolverOptions, require_free_ends, solve_from
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import evaluate
 
@@ -133,7 +132,7 @@ def improve(planner: MotionPlanner, path: Path) -> None:
 
 def settle(planner: MotionPlanner, path: Path) -> None:
     """Replace the problems without a known way by others of their kind."""
-    from marl_handover.motion.ompl_planner import rrt_connect
+    from ompl_planner import rrt_connect
 
     rows, out = read(path), []
     spare = iter(list(problems(planner, 200, SEED + 1)))

@@ -7,9 +7,54 @@ with ``exit_status``.
 from __future__ import annotations
 
 import errno
+import re
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 from typing import Any
+
+PACKAGE = "marl_handover"
+CORE = ""
+"""The name under which :func:`requirements` has what is needed without any extra."""
+
+
+def requirements() -> dict[str, tuple[str, ...]]:
+    """Requirements such as ``"viser>=1.1"`` of the core and of each extra; empty if nothing tells.
+
+    They are those of the checkout's pyproject.toml or of the installed package's metadata. An editable install's metadata is as old as the
+    install, so the checkout goes first.
+    """
+    file = Path(__file__).resolve().parents[1] / "pyproject.toml"
+    if file.is_file():
+        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
+        return {CORE: tuple(project["dependencies"]), **{extra: tuple(lines) for extra, lines in project["optional-dependencies"].items()}}
+    try:
+        return by_extra(requires(PACKAGE) or [])
+    except PackageNotFoundError:
+        return {}
+
+
+def by_extra(lines: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """Requirements of the core and of each extra, from the lines of a package's metadata."""
+    found: dict[str, list[str]] = {}
+    for line in lines:
+        extra = re.search(r"extra\s*==\s*['\"]([^'\"]+)", line)
+        found.setdefault(extra[1] if extra else CORE, []).append(line.partition(";")[0].strip())
+    return {extra: tuple(needed) for extra, needed in found.items()}
+
+
+def name_of(requirement: str) -> str:
+    """The package of a requirement, without versions, extras and conditions."""
+    return re.split(r"[^\w.-]", requirement.strip(), maxsplit=1)[0]
+
+
+def install_line(extra: str = CORE, only: Iterable[str] = ()) -> str:
+    """The command that installs what an extra needs, or, of that, the packages named in ``only``."""
+    wanted = {name.lower() for name in only}
+    needed = [line for line in requirements().get(extra, ()) if not wanted or name_of(line).lower() in wanted] or list(only)
+    return "pip install " + " ".join(f"'{line}'" if re.search(r"[<>=!~\[; ]", line) else line for line in needed)
+
 
 LONGEST_VALUE, LONGEST_LIST, LONGEST_REASON = 120, 160, 220
 """Characters of a value, of a list of choices and of a reason in a message."""
@@ -219,7 +264,7 @@ class MissingExtra(HandoverError):
     """A setting needs a package that is not installed."""
 
     def __init__(self, setting: str, package: str, extra: str) -> None:
-        from marl_handover.requirements import install_line  # here: a stop needs errors, and must not wait for package metadata
+        from marl_handover.errors import install_line  # here: a stop needs errors, and must not wait for package metadata
 
         super().__init__(f"{setting} needs the package {package}; run: {install_line(extra)}")
         self.setting, self.package, self.extra = setting, package, extra

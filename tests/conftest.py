@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import signal
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import settings
 
-from marl_handover.cell import Cell, load_cell
+from marl_handover.cell import Cell, build_cell, cell_config, load_cell
 from marl_handover.config import RewardConfig, TaskConfig
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Rules
 
 pytest_plugins = ["learning_fixtures"]
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bench"))  # scripts, no package
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
 torch.set_num_threads(1)
@@ -53,6 +56,20 @@ def paper() -> Cell:
 @pytest.fixture(scope="session", params=["paper", "al5a"])
 def cell(request) -> Cell:
     return load_cell(request.param)
+
+
+@pytest.fixture(scope="session")
+def model():
+    """The paper's cell with its arms and their shapes."""
+    return build_cell(cell_config("paper"))
+
+
+@pytest.fixture(scope="session")
+def planner(model):
+    """Its motion planner, whose kernels are compiled once."""
+    from marl_handover.motion.planner import MotionPlanner
+
+    return MotionPlanner(model)
 
 
 @pytest.fixture(scope="session")

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from marl_handover import cli
-from marl_handover.errors import InvalidSetting, MissingExtra, WorkFailed
-from marl_handover.requirements import by_extra, install_line, name_of, requirements
+from marl_handover.errors import InvalidSetting, MissingExtra, WorkFailed, by_extra, install_line, name_of, requirements
 
 ROOT = Path(__file__).resolve().parent.parent
 

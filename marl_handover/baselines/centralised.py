@@ -28,7 +28,7 @@ from marl_handover.learning.networks import LOG_STD_RANGE, AfterstateCritic, Hyb
 from marl_handover.learning.replay import HindsightReplayBuffer
 from marl_handover.learning.settings import SacConfig, TrainConfig
 from marl_handover.learning.variant import Variant
-from marl_handover.motion.transfer_features import FIELDS, mirrored_numbers, transfer_features
+from marl_handover.motion.batched_paths import FIELDS, mirrored_numbers, transfer_features
 from marl_handover.task.observations import ARM_FIELDS
 from marl_handover.task.rules import Rules
 

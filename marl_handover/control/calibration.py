@@ -22,9 +22,8 @@ from marl_handover.hardware.calibration import CalibrationProblem, shifted
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.settings import ARMS, GripperConfig
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.perception.calibration import CameraCalibration, Pixels
+from marl_handover.perception.calibration import CameraCalibration, Pixels, calibrate_lens
 from marl_handover.perception.camera import Camera
-from marl_handover.perception.intrinsics import calibrate_lens
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
 from marl_handover.perception.settings import BoardConfig
 from marl_handover.perception.sheets import Sheet, charuco_sheet

@@ -11,8 +11,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from marl_handover.geometry.se3 import apply, flat_pose
-from marl_handover.perception.calibration import CalibrationFailed, CameraCalibration, Floats, Intrinsics, Pixels
-from marl_handover.perception.intrinsics import BoardFinder
+from marl_handover.perception.calibration import BoardFinder, CalibrationFailed, CameraCalibration, Floats, Intrinsics, Pixels
 from marl_handover.perception.markers import MarkerFinder
 from marl_handover.perception.settings import BoardConfig
 

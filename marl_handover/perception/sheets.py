@@ -12,14 +12,16 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from marl_handover.config import BlockConfig, require_choice
-from marl_handover.errors import HandoverError, InvalidSetting
+from marl_handover.errors import HandoverError, InvalidSetting, install_line
 from marl_handover.files import make_folder, writing
-from marl_handover.perception.calibration import Floats, Pixels
 from marl_handover.perception.settings import BoardConfig, TargetConfig
-from marl_handover.requirements import install_line
+
+Floats = NDArray[np.float64]
+Pixels = NDArray[np.uint8]
 
 _NAMES = {"16h5": "DICT_APRILTAG_16h5", "25h9": "DICT_APRILTAG_25h9", "36h11": "DICT_APRILTAG_36h11"}
 WHITE, BLACK = 255, 0

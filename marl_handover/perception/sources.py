@@ -15,13 +15,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile
+from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, install_line
 from marl_handover.files import read_bounded
 from marl_handover.perception.calibration import Pixels
 from marl_handover.perception.camera import Camera, Clock, EndOfFrames, Frame, LiveCamera, NoCamera, RenderedCamera, Reopening
 from marl_handover.perception.overlay import decoded
 from marl_handover.perception.settings import CameraConfig
-from marl_handover.requirements import install_line
 from marl_handover.wording import counted
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")

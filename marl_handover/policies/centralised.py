@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from marl_handover.envs.centralised import CentralisedRules
 from marl_handover.errors import InvalidSetting
-from marl_handover.motion.transfer_features import mirrored_numbers, transfer_features
+from marl_handover.motion.batched_paths import mirrored_numbers, transfer_features
 from marl_handover.policies.files import network_layers
 from marl_handover.policies.network import NetworkPolicy
 from marl_handover.policies.policy import Floats, SupervisorPolicy

@@ -15,7 +15,7 @@ from marl_handover.learning.algorithm import stepped
 from marl_handover.learning.checkpoint import policy_arrays, save_policy
 from marl_handover.learning.trainer import Trainer
 from marl_handover.learning.variant import make_variant
-from marl_handover.motion.transfer_features import mirrored_numbers
+from marl_handover.motion.batched_paths import mirrored_numbers
 from marl_handover.policies import SupervisorPolicy
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Rules

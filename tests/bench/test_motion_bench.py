@@ -1,20 +1,15 @@
 from __future__ import annotations
 
 import json
-import sys
-from pathlib import Path
-
-import numpy as np
-import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
 
 import motion
 import motion_peers
+import numpy as np
+import pytest
 import transfers
+from ompl_planner import STEP_RAD
 
 from marl_handover.cell import build_cell, cell_config
-from marl_handover.motion.ompl_planner import STEP_RAD
 from marl_handover.motion.path_optimizer import NoPath
 from marl_handover.motion.planner import MotionPlanner
 

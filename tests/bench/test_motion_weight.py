@@ -1,15 +1,10 @@
 from __future__ import annotations
 
-import sys
 from copy import copy
-from pathlib import Path
-
-import numpy as np
-import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
 
 import motion_weight
+import numpy as np
+import pytest
 
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.motion.planner import MotionPlanner

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +11,6 @@ import pytest
 import torch
 
 pytest.importorskip("stable_baselines3", reason="the peers extra is not installed")
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
 
 import common
 import peers

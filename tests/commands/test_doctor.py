@@ -13,12 +13,12 @@ from packaging.requirements import Requirement
 
 from marl_handover.cli import main
 from marl_handover.commands import doctor
+from marl_handover.errors import CORE, by_extra, name_of, requirements
 from marl_handover.hardware import session_registry, settings, transport
 from marl_handover.hardware.emulator.board import EmulatedBoard
 from marl_handover.hardware.emulator.device import EmulatedDevice
 from marl_handover.hardware.emulator.pty import PtyEmulator
 from marl_handover.hardware.estop import StopLatch
-from marl_handover.requirements import CORE, by_extra, name_of, requirements
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from marl_handover.cell.build import CellModel, build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.driver import ArmDriver
@@ -27,11 +26,6 @@ def _no_handler_of_others():
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
-
-
-@pytest.fixture(scope="session")
-def model() -> CellModel:
-    return build_cell(cell_config("paper"))
 
 
 @pytest.fixture(scope="session")

@@ -172,8 +172,8 @@ def test_bad_commands_are_named(model, planner, changes, error, text):
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        ("arm_clearance_mm", -1.0), ("lift_scale_mm", 0.0), ("velocity_scale", 1.5), ("control_points", 6), ("degree", 2), ("starts", 0),
-        ("sample_s", 0.1), ("parked_deg", [0.0, 0.0, 0.0, 0.0, 0.0]), ("parked_deg", [0.0, 140.0]),
+        ("arm_clearance_mm", -1.0), ("lift_scale_mm", 0.0), ("velocity_scale", 1.5), ("control_points", 6), ("degree", 2),
+        ("num_initial_guesses", 0), ("sample_s", 0.1), ("parked_deg", [0.0, 0.0, 0.0, 0.0, 0.0]), ("parked_deg", [0.0, 140.0]),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(model, setting, value):

@@ -8,11 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.geometry.se3 import flat_pose
-from marl_handover.perception.calibration import CameraCalibration, hung_camera
-from marl_handover.perception.intrinsics import calibrate_lens
+from marl_handover.perception.calibration import CameraCalibration, calibrate_lens, hung_camera
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.perception.settings import BoardConfig, LookConfig, MountConfig
@@ -21,11 +19,6 @@ from marl_handover.perception.sheets import charuco_sheet
 SIZE_PX = (1280, 720)
 PLACES = ((-80.0, 0.0, math.pi / 2), (80.0, 10.0, -math.pi / 2))
 cv2.setNumThreads(1)
-
-
-@pytest.fixture(scope="session")
-def model():
-    return build_cell(cell_config("paper"))
 
 
 @pytest.fixture(scope="session")

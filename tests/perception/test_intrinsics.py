@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from marl_handover.geometry.se3 import flat_pose
-from marl_handover.perception.calibration import CalibrationFailed, CameraCalibration, Intrinsics
-from marl_handover.perception.intrinsics import calibrate_lens
+from marl_handover.perception.calibration import CalibrationFailed, CameraCalibration, Intrinsics, calibrate_lens
 from marl_handover.perception.scene import Renderer, held_boards, sheet_shape
 from marl_handover.perception.sheets import charuco_sheet
 

@@ -5,18 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.motion.trajectory import Phase
 from marl_handover.simulation.world import BulletCell
 
 ABOVE_MM = 40.0
 SAMPLES = 60
-
-
-@pytest.fixture(scope="session")
-def model():
-    return build_cell(cell_config("paper"))
 
 
 @pytest.fixture(scope="session")

@@ -4,28 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import sys
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
 pytest.importorskip("viser", reason="the view extra is not installed")
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
-
-from marl_handover.cell import CellModel, build_cell, cell_config
 from marl_handover.commands.view import ViewCommand, serve
 from marl_handover.viewer.server import open_server
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 # Without a graphics card; the page needs WebGL all the same.
 OPTIONS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-
-
-@pytest.fixture(scope="session")
-def model() -> CellModel:
-    return build_cell(cell_config("paper"))
 
 
 @pytest.fixture

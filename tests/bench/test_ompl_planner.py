@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from ompl_planner import STEP_RAD, OmplMissing, rrt_connect
 
 from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed
-from marl_handover.motion.ompl_planner import STEP_RAD, OmplMissing, rrt_connect
 
 pytest.importorskip("ompl")
 

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.config import require_positive, require_seed
-from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed
-from marl_handover.requirements import install_line
+from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed, install_line
 
 Floats = NDArray[np.float64]
 

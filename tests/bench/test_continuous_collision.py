@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from continuous_collision import certify
 
-from marl_handover.motion.continuous_collision import certify
 from marl_handover.motion.initial_guesses import fit_control_points
 from marl_handover.motion.trajectory import evaluate
 from tests.motion.test_motion_planner import place
