@@ -14,7 +14,7 @@ import enum
 import math
 import numbers
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ class Bounds:
     low: float = -math.inf
     high: float = math.inf
     whole: bool = False
-    choices: tuple[Any, ...] = ()
+    choices: Collection[Any] = ()
     length: tuple[int, int] = (0, LONGEST_LIST)
     inner: tuple[int, int] = (0, LONGEST_LIST)
     items: str = "items"
@@ -89,9 +89,9 @@ def bounded(
     return _field(default, Bounds(low, high, whole, length=length or _GENERAL.length, inner=inner or _NO_LISTS, items=items))
 
 
-def chosen(default: Any, choices: Sequence[Any]) -> Any:
-    """A dataclass field for one of ``choices``; of a list, each item."""
-    return _field(default, Bounds(choices=tuple(choices)))
+def chosen(default: Any, choices: Collection[Any]) -> Any:
+    """A dataclass field for one of ``choices``, which may grow; of a list, each item."""
+    return _field(default, Bounds(choices=choices))
 
 
 def path_field(default: str | None = "") -> Any:
@@ -227,7 +227,7 @@ def _plain(number: float) -> str:
     return str(number) if isinstance(number, int) and abs(number) < 10**10 else f"{number:g}"
 
 
-def require_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+def require_choice(name: str, value: Any, choices: Collection[str]) -> None:
     """Raise :class:`UnknownChoice` unless ``value`` is one of ``choices``."""
     if value not in choices:
         raise UnknownChoice(name, value, choices)

@@ -85,7 +85,6 @@ def _guarded(name: str, arguments: list[str]) -> int:
     speaker, debug = f"{PROGRAM} {name}", False
     try:
         debug, arguments = _take_debug(arguments)
-        arguments = take_plugins(arguments)
         status = _dispatch(name, arguments)
         sys.stdout.flush()  # here, so that a closed pipe shows itself inside this try
         return status
@@ -125,12 +124,21 @@ def _output_lost() -> bool:
 def _dispatch(name: str, arguments: list[str]) -> int:
     command = COMMANDS[name]
     begun = (importlib.import_module(command.first).at_once(arguments),) if command.first else ()
-    from marl_handover.progress import showing, working  # after that: a stop waits for nothing
+    from marl_handover.progress import working  # after that: a stop waits for nothing
 
     with working("loading the libraries", logged=False):
         module: Any = importlib.import_module(command.module)
+    from marl_handover.plugins import added
+
+    plugins, arguments = take_plugins(arguments)
+    with added(plugins):
+        return _run(command, module, name, arguments, begun)
+
+
+def _run(command: Command, module: Any, name: str, arguments: list[str], begun: tuple[Any, ...]) -> int:
     from marl_handover.compose import compose
     from marl_handover.compose_help import keys_help
+    from marl_handover.progress import showing
 
     if any(argument in ("--help", "-h") for argument in arguments):
         print(f"usage: {PROGRAM} {name} [key=value ...]\n\n{command.summary}\n\n{keys_help(module.SCHEMA, module.ALIASES, module.GROUPS)}")
@@ -157,15 +165,11 @@ def _take_debug(arguments: list[str]) -> tuple[bool, list[str]]:
     return debug, rest
 
 
-def take_plugins(arguments: list[str]) -> list[str]:
-    """``plugins=FILE.py`` is a key of every command too: these files are loaded before any other key is read."""
-    paths = [argument.partition("=")[2] for argument in arguments if argument.startswith("plugins=")]
-    if paths:
-        from marl_handover.plugins import add_plugins
-
-        for path in paths:
-            add_plugins(path)
-    return [argument for argument in arguments if not argument.startswith("plugins=")]
+def take_plugins(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """``plugins=FILE.py``, or ``plugins=[ONE.py,OTHER.py]``, is a key of every command too: take the files out."""
+    given = [argument.partition("=")[2].strip("[]").split(",") for argument in arguments if argument.startswith("plugins=")]
+    paths = [path.strip() for files in given for path in files if path.strip()]
+    return paths, [argument for argument in arguments if not argument.startswith("plugins=")]
 
 
 def _overview() -> str:

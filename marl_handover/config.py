@@ -25,8 +25,11 @@ from marl_handover.bounds import (
     sized,
 )
 from marl_handover.errors import InvalidSetting
+from marl_handover.plugins import Registry
 
 __all__ = [
+    "BACKENDS",
+    "LAYOUTS",
     "MAX_SEED",
     "ArmConfig",
     "BlockConfig",
@@ -55,7 +58,21 @@ __all__ = [
 ]
 
 ARCHITECTURES = ("A", "B")
-LAYOUTS = ("raw", "relative", "object")
+LAYOUTS: Registry[Any] = Registry(
+    "layout", {name: f"marl_handover.task.observations:{name.upper()}" for name in ("raw", "relative", "object")}
+)
+"""Observation layouts, each a :class:`~marl_handover.task.observations.Layout`."""
+BACKENDS: Registry[Any] = Registry(
+    "backend",
+    {
+        "kinematic": "marl_handover.envs.backends:KinematicBackend",
+        "noisy": "marl_handover.envs.backends:NoisyBackend",
+        "bullet": "marl_handover.simulation.backend:BulletBackend",
+        "twin": "marl_handover.control.hardware_backend:TwinBackend",
+        "hardware": "marl_handover.control.hardware_backend:HardwareBackend",
+    },
+)
+"""Classes with the methods of :class:`~marl_handover.envs.backends.Backend`, called with a model, motion settings and own options."""
 MOTION_METHODS = ("optimised", "paper")
 EXPLORATIONS = ("chart", "area")
 LEARNERS = ("independent", "shared", "ctde")

@@ -10,9 +10,10 @@ import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from marl_handover.errors import CorruptFile, HandoverError, MissingFile, UnknownChoice, first_line
 from marl_handover.files import expanded
@@ -28,15 +29,13 @@ _loaded: set[str] = set()
 class Registry(Mapping[str, Entry]):
     """What names stand for.
 
-    A shipped name says which module registers it, so that the module is imported when the name is used and not before.
-
     Args:
         what: kind of the entries, for messages.
-        modules: shipped name -> module.
+        shipped: name -> ``module:attribute``, imported when the name is used and not before.
     """
 
-    def __init__(self, what: str, modules: Mapping[str, str] | None = None) -> None:
-        self.what, self._modules = what, dict(modules or {})
+    def __init__(self, what: str, shipped: Mapping[str, str] | None = None) -> None:
+        self.what, self._shipped = what, dict(shipped or {})
         self._entries: dict[str, Entry] = {}
 
     def register(self, name: str) -> Callable[[Entry], Entry]:
@@ -48,22 +47,27 @@ class Registry(Mapping[str, Entry]):
 
         return add
 
+    def without(self, *names: str) -> Choices:
+        """All names but these, now and later."""
+        return Choices(self, names)
+
     def __getitem__(self, name: str) -> Entry:
+        if name in self._entries:
+            return self._entries[name]
+        if name not in self:
+            raise UnknownChoice(self.what, name, self)
         if name not in self._entries:
-            load_plugins()
-            if name in self._modules:
-                importlib.import_module(self._modules[name])
-        if name not in self._entries:
-            raise UnknownChoice(self.what, name, tuple(self))
+            module, _, attribute = self._shipped[name].partition(":")
+            self._entries[name] = getattr(importlib.import_module(module), attribute)
         return self._entries[name]
 
     def __contains__(self, name: object) -> bool:
         load_plugins()
-        return name in self._modules or name in self._entries
+        return name in self._shipped or name in self._entries
 
     def __iter__(self) -> Iterator[str]:
         load_plugins()
-        return iter(dict.fromkeys([*self._modules, *self._entries]))
+        return iter(dict.fromkeys([*self._shipped, *self._entries]))
 
     def __len__(self) -> int:
         return len(list(iter(self)))
@@ -74,15 +78,41 @@ class Registry(Mapping[str, Entry]):
     __hash__ = object.__hash__
 
 
-def add_plugins(paths: str) -> None:
-    """Add Python files, separated by commas, to those that are loaded when a name is looked for.
+class Choices(Collection[str]):
+    """The names of a registry that a setting may have."""
+
+    def __init__(self, registry: Registry[Any], left_out: tuple[str, ...]) -> None:
+        self._registry, self._left_out = registry, left_out
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._registry and name not in self._left_out
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name in self._registry if name not in self._left_out)
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+@contextmanager
+def added(paths: Iterable[str]) -> Iterator[None]:
+    """Within, these Python files are listed too, for this process and those that it starts. What they registered stays.
 
     Raises:
         MissingFile, CorruptFile: there is no such file, or it cannot be imported.
     """
-    files = [str(expanded(path.strip()).absolute()) for path in paths.strip("[]").split(",") if path.strip()]
-    os.environ[VARIABLE] = os.pathsep.join([*filter(None, os.environ.get(VARIABLE, "").split(os.pathsep)), *files])
-    load_plugins()
+    before = os.environ.get(VARIABLE)
+    files = [str(expanded(path).absolute()) for path in paths]
+    if files:
+        os.environ[VARIABLE] = os.pathsep.join([*filter(None, [before]), *files])
+    try:
+        load_plugins()
+        yield
+    finally:
+        if files and before is None:
+            del os.environ[VARIABLE]
+        elif files and before is not None:
+            os.environ[VARIABLE] = before
 
 
 def load_plugins() -> None:

@@ -34,6 +34,7 @@ from typing import NamedTuple
 from marl_handover.cli import COMMANDS, PROGRAM, main, take_plugins
 from marl_handover.compose import compose
 from marl_handover.errors import HandoverError, UnknownKey
+from marl_handover.plugins import added
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -126,8 +127,10 @@ def check_line(words: list[str]) -> None:
     """Raise unless the command exists and takes its keys and values."""
     command, *arguments = words[1:]
     module = importlib.import_module(COMMANDS[command].module)
-    given = [argument for argument in take_plugins(arguments) if argument != "--help" and not argument.startswith("debug=")]
-    assert isinstance(compose(module.SCHEMA, given, groups=module.GROUPS, aliases=module.ALIASES), module.SCHEMA)
+    plugins, arguments = take_plugins(arguments)
+    given = [argument for argument in arguments if argument != "--help" and not argument.startswith("debug=")]
+    with added(plugins):
+        assert isinstance(compose(module.SCHEMA, given, groups=module.GROUPS, aliases=module.ALIASES), module.SCHEMA)
 
 
 def write_file(block: Block) -> None:

@@ -56,6 +56,8 @@ class DqnConfig(OffPolicyConfig):
     def validate(self) -> None:
         """As the base class, and what only this algorithm has."""
         super().validate()
+        if self.layout not in ("raw", "relative"):
+            raise InvalidSetting("algorithm.layout", self.layout, "'raw' or 'relative' for algorithm=dqn")
         if self.exploration != "chart":
             raise InvalidSetting("algorithm.exploration", self.exploration, "'chart' for algorithm=dqn, whose grid is even on the table")
 

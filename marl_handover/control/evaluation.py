@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from marl_handover import policies
 from marl_handover.arrays import one_where, wrap
 from marl_handover.config import (
+    BACKENDS,
     CellConfig,
     LoopConfig,
     MotionConfig,
@@ -44,15 +45,13 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-BACKENDS = ("kinematic", "noisy", "bullet", "twin")
-
 
 @dataclass
 class AssessmentConfig:
     """Who is judged, where, on which problems. What is not given is the policy's own, or the default."""
 
     policy: str = path_field("exact")  # exact, random, greedy, pretrained_a or _b or _twin, a run directory or a policy file
-    backend: str = chosen("kinematic", BACKENDS)  # kinematic; in closed loop with planned motions: noisy, bullet or twin
+    backend: str = chosen("kinematic", BACKENDS.without("hardware"))  # kinematic; in closed loop with planned motions: the others
     episodes: int = bounded(1000, 1, 10**6)  # random problems
     seed: int = seed_field()  # of the problems, and of execution noise but for the twin, whose servos go on as they are
     cell: CellConfig | None = None  # single keys change the paper cell

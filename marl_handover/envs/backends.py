@@ -5,17 +5,16 @@ A backend knows the arms and the object, nothing of goals and rewards. It is giv
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.arrays import wrap
 from marl_handover.cell import CellModel
-from marl_handover.config import MotionConfig, NoiseConfig, TaskConfig, require_at_least, require_between, require_choice
+from marl_handover.config import BACKENDS, MotionConfig, NoiseConfig, TaskConfig, require_at_least, require_between
 from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
 from marl_handover.envs.top_view import TopView
 from marl_handover.errors import InvalidSetting
@@ -196,21 +195,11 @@ class NoisyBackend(KinematicBackend):
         return done._replace(pose=self._pose.copy())
 
 
-BACKENDS = {
-    "kinematic": f"{__name__}:KinematicBackend",
-    "noisy": f"{__name__}:NoisyBackend",
-    "bullet": "marl_handover.simulation.backend:BulletBackend",
-    "twin": "marl_handover.control.hardware_backend:TwinBackend",
-    "hardware": "marl_handover.control.hardware_backend:HardwareBackend",
-}
-"""Name -> "module:Class", imported at use: the environments need no simulator."""
-
-
 def make_backend(name: str, model: CellModel, task: TaskConfig, motion: MotionConfig, **options: Any) -> Backend:
     """A backend by name; ``noisy`` takes the task's noise, if there is any.
 
     Args:
-        name: ``kinematic``, ``noisy``, ``bullet``, ``twin`` or ``hardware``.
+        name: ``kinematic``, ``noisy``, ``bullet``, ``twin``, ``hardware``, or one that a plugin registered.
         model: the cell.
         task: the task's settings.
         motion: how the arms move.
@@ -219,8 +208,7 @@ def make_backend(name: str, model: CellModel, task: TaskConfig, motion: MotionCo
     Raises:
         UnknownChoice: for another name.
     """
-    require_choice("backend", name, tuple(BACKENDS))
     if name == "noisy" and (task.noise.position_mm > 0 or task.noise.yaw_deg > 0):
         options.setdefault("noise", task.noise)
-    module, _, member = BACKENDS[name].partition(":")
-    return cast(Backend, getattr(importlib.import_module(module), member)(model, motion, **options))
+    backend: Backend = BACKENDS[name](model, motion, **options)
+    return backend

@@ -22,7 +22,7 @@ from marl_handover.files import expanded
 from marl_handover.learning.recorder import machine
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.locks import held
-from marl_handover.policies.registry import NAMES
+from marl_handover.policies.registry import names
 from marl_handover.policies.shielded import SHIELDED
 
 ASKED, TRAINED, DONE = (f"{name}.json" for name in RECORDS)
@@ -332,11 +332,11 @@ def _placed(policy: str) -> str:
     """A policy's name, its path absolute if it is one."""
     if policy.startswith(SHIELDED):
         return SHIELDED + _placed(policy.removeprefix(SHIELDED))
-    if policy in NAMES:
+    if policy in names():
         return policy
     path = expanded(policy)
     if path.parent == Path() and path.suffix != ".npz" and not path.exists():
-        raise UnknownChoice("policy", policy, (*NAMES, f"{SHIELDED}NAME", "a run directory", "a policy file (.npz)"))
+        raise UnknownChoice("policy", policy, (*names(), f"{SHIELDED}NAME", "a run directory", "a policy file (.npz)"))
     return str(path.absolute())
 
 

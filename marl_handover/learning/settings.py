@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from marl_handover.config import (
+    BACKENDS,
     EPSILON_DEG,
     EXPLORATIONS,
     HINDSIGHT,
@@ -123,8 +124,11 @@ class ReplayConfig:
 ALGORITHMS: Registry[type[AlgorithmConfig]] = Registry(
     "algorithm",
     {
-        "sac": "marl_handover.learning.hybrid_sac",
-        **{name: f"marl_handover.baselines.{name}" for name in ("flat_sac", "td3", "ppo", "dqn")},
+        "sac": "marl_handover.learning.hybrid_sac:SacConfig",
+        "flat_sac": "marl_handover.baselines.flat_sac:FlatSacConfig",
+        "td3": "marl_handover.baselines.td3:Td3Config",
+        "ppo": "marl_handover.baselines.ppo:PpoConfig",
+        "dqn": "marl_handover.baselines.dqn:DqnConfig",
     },
 )
 """Settings of each algorithm by name; :func:`marl_handover.learning.algorithm.register_algorithm` adds one, with its learner."""
@@ -133,7 +137,6 @@ VARIANTS: dict[str, Collection[str]] = {"hierarchical": ALGORITHMS, "centralised
 """Formulations, and the algorithms that each has learners for."""
 
 SOURCES = ("batched", "aec")
-BACKENDS = ("kinematic", "noisy", "bullet")
 EXECUTORS = ("direct", "optimised")
 COLLECTORS = ("local", "multiprocess", "ray")
 
@@ -155,7 +158,7 @@ class TrainConfig:
     centralised: CentralisedConfig = field(default_factory=CentralisedConfig)
     decentralised: DecentralisedConfig = field(default_factory=DecentralisedConfig)
     source: str = chosen("batched", SOURCES)  # of transitions: batched (the rule book itself), or aec (the PettingZoo environment)
-    backend: str = chosen("kinematic", BACKENDS)  # of source=aec: kinematic, noisy or bullet
+    backend: str = chosen("kinematic", BACKENDS.without("twin", "hardware"))  # of source=aec: kinematic, noisy or bullet
     executor: str = chosen("direct", EXECUTORS)  # of source=aec: direct (straight in joint space), or optimised (collision-free)
     collector: str = chosen("local", COLLECTORS)  # of source=aec: local, multiprocess or ray
     workers: int = bounded(2, 1, 256)  # of collector=multiprocess and ray

@@ -1,14 +1,13 @@
 """Supervisor policies by name, as plain callables on numpy. Nothing here needs torch unless a run directory's checkpoint is read."""
 
-from marl_handover.policies.baselines import ExactPolicy, GreedyPolicy, RandomPolicy
+from marl_handover.policies.actor import NetworkPolicy
 from marl_handover.policies.files import read_policy, stored_settings
-from marl_handover.policies.network import NetworkPolicy
 from marl_handover.policies.policy import SupervisorPolicy
-from marl_handover.policies.registry import NAMES, adapted, load
+from marl_handover.policies.registry import POLICIES, ExactPolicy, GreedyPolicy, RandomPolicy, adapted, load, names
 from marl_handover.policies.shielded import ShieldedPolicy
 
 __all__ = [
-    "NAMES",
+    "POLICIES",
     "ExactPolicy",
     "GreedyPolicy",
     "NetworkPolicy",
@@ -17,6 +16,7 @@ __all__ = [
     "SupervisorPolicy",
     "adapted",
     "load",
+    "names",
     "read_policy",
     "stored_settings",
 ]

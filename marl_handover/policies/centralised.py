@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from marl_handover.envs.centralised import CentralisedRules
 from marl_handover.errors import InvalidSetting
 from marl_handover.motion.batched_paths import mirrored_numbers, transfer_features
+from marl_handover.policies.actor import NetworkPolicy
 from marl_handover.policies.files import network_layers
-from marl_handover.policies.network import NetworkPolicy
 from marl_handover.policies.policy import Floats, SupervisorPolicy
 from marl_handover.task.rules import Rules
 

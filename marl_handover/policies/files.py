@@ -16,12 +16,12 @@ from marl_handover.parsing import parse_object
 from marl_handover.task.observations import observation_size
 
 KINDS = {
-    "hybrid": "marl_handover.policies.network:NetworkPolicy",
-    "box": "marl_handover.policies.network:NetworkPolicy",
+    "hybrid": "marl_handover.policies.actor:NetworkPolicy",
+    "box": "marl_handover.policies.actor:NetworkPolicy",
     "centralised": "marl_handover.policies.centralised:CentralisedPolicy",
     "centralised_box": "marl_handover.policies.centralised:CentralisedPolicy",
-    "discrete": "marl_handover.policies.discrete:DiscretePolicy",
-    "turns": "marl_handover.policies.decentralised:TurnsPolicy",
+    "discrete": "marl_handover.policies.actor:DiscretePolicy",
+    "turns": "marl_handover.policies.actor:TurnsPolicy",
 }
 """Forms of an actor, and the class that evaluates each, imported when it is needed."""
 

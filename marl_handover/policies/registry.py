@@ -1,11 +1,13 @@
-"""Policies by name."""
+"""Policies by name: those that learned nothing, those that were trained, and those that a plugin registers."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,23 +15,94 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.arrays import select
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import CellConfig, CentralisedConfig, MotionConfig, TaskConfig
 from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, MissingFile, UnknownChoice, first_line
 from marl_handover.files import expanded
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.parsing import parse_object
-from marl_handover.policies.baselines import ExactPolicy, GreedyPolicy, RandomPolicy
+from marl_handover.plugins import Registry
 from marl_handover.policies.files import KINDS, read_policy, require_policy, stored_settings
-from marl_handover.policies.policy import SupervisorPolicy
+from marl_handover.policies.policy import Floats, SupervisorPolicy
 from marl_handover.policies.shielded import SHIELDED, ShieldedPolicy
 from marl_handover.resources import package_path
+from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Rules
 
 Arrays = Mapping[str, NDArray[Any]]
 
-BASELINES = ("exact", "random", "greedy")
-NAMES = (*BASELINES, "pretrained_a", "pretrained_b", "pretrained_twin")
+POLICIES: Registry[Callable[[Rules, int], SupervisorPolicy]] = Registry("policy")
+"""Policies that need no file: called with a rule book and a seed. ``POLICIES.register("NAME")`` adds one."""
+
+PRETRAINED = ("pretrained_a", "pretrained_b", "pretrained_twin")
+
+
+def names() -> tuple[str, ...]:
+    """All names of policies."""
+    return (*POLICIES, *PRETRAINED)
+
+
+@POLICIES.register("exact")
+class ExactPolicy(SupervisorPolicy):
+    """The exact planner in closed loop: the yardstick."""
+
+    def __init__(self, rules: Rules, seed: int = 0) -> None:
+        super().__init__(rules, "exact")
+        self.planner = ExactPlanner(rules)
+
+    def under(self, rules: Rules) -> SupervisorPolicy:
+        """The same with a planner for that rule book."""
+        other = copy(self)
+        other.rules, other.planner = rules, ExactPlanner(rules)
+        return other
+
+    def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        """The first action of an optimal plan."""
+        return self.planner.act(pose, goal)
+
+
+@POLICIES.register("random")
+class RandomPolicy(SupervisorPolicy):
+    """Uniform actions."""
+
+    def __init__(self, rules: Rules, seed: int = 0) -> None:
+        super().__init__(rules, "random")
+        self.generator = np.random.default_rng(seed)
+
+    def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        """Anything."""
+        return self.generator.uniform(-1.0, 1.0, (*pose.shape[:-1], 4))
+
+
+@POLICIES.register("greedy")
+class GreedyPolicy(SupervisorPolicy):
+    """Nearest arm: finishes when an arm can; else the nearer arm hands over, at the place of a few that leaves the other the
+    least error.
+    """
+
+    PLACES = 33
+
+    def __init__(self, rules: Rules, seed: int = 0) -> None:
+        super().__init__(rules, "greedy")
+
+    def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        """One greedy step ahead."""
+        cell = self.rules.cell
+        able = self.rules.can_finish(pose, goal)
+        finish = able.any(-1)
+        square, yaw = cell.polar(pose)
+        near = np.where(cell.within(square, yaw), square, math.inf).argmin(-1)
+        alpha = np.linspace(-1.0, 1.0, self.PLACES)
+        table = cell.chart.to_table(alpha, 0 * alpha)
+        turn = cell.polar(table)[1] - yaw[..., None, :]
+        placed_theta = pose[..., 2, None] + select(turn, np.broadcast_to(near[..., None], turn.shape[:-1]))
+        placed = np.concatenate([np.broadcast_to(table, (*placed_theta.shape, 2)), placed_theta[..., None]], -1)
+        error = abs(self.rules.finishing_error(placed, np.broadcast_to(goal[..., None, :], placed.shape)))
+        other = np.broadcast_to((1 - near)[..., None], placed_theta.shape)
+        best = select(error, other).argmin(-1)
+        arm = np.where(finish, able.argmax(-1), near)
+        return np.stack([np.where(finish, 1.0, -1.0), np.where(arm > 0, 1.0, -1.0), alpha[best], 0.0 * alpha[best]], -1)
 
 
 def load(
@@ -53,10 +126,8 @@ def load(
         if inner.startswith(SHIELDED):
             raise InvalidSetting("policy", name, f"shielded once, {SHIELDED}NAME")
         return ShieldedPolicy(load(inner, cell, task, seed, motion=motion))
-    if name in BASELINES:
-        rules = _rules(cell or load_cell(), task or TaskConfig(), motion)
-        made = {"exact": ExactPolicy, "greedy": GreedyPolicy}
-        return RandomPolicy(rules, seed) if name == "random" else made[name](rules)
+    if name in POLICIES:
+        return POLICIES[name](_rules(cell or load_cell(), task or TaskConfig(), motion), seed)
     arrays = _arrays(name)
     try:
         policy = _made(name, arrays, cell, task, motion)
@@ -122,7 +193,7 @@ def content_hash(name: str) -> str:
         UnknownChoice, MissingFile, CorruptFile, CheckpointMismatch: as :func:`load`.
     """
     name = name.removeprefix(SHIELDED)
-    if name in BASELINES:
+    if name in POLICIES:
         return ""
     digest = hashlib.sha256()
     arrays = dict(_arrays(name))
@@ -144,7 +215,7 @@ def _rules(cell: Cell, task: TaskConfig, motion: MotionConfig | None, about: Map
 
 
 def _arrays(name: str) -> Arrays:
-    if name in NAMES:
+    if name in PRETRAINED:
         return read_policy(package_path(f"pretrained/{name.removeprefix('pretrained_')}.npz"))
     path = expanded(name)
     if path.is_dir():
@@ -156,5 +227,5 @@ def _arrays(name: str) -> Arrays:
     if path.suffix == ".npz":
         return read_policy(path)
     if path.exists() or path.parent != Path():
-        raise MissingFile("run directory or policy file", path, f"or choose one of: {', '.join(NAMES)}")
-    raise UnknownChoice("policy", name, (*NAMES, f"{SHIELDED}NAME", "a run directory", "a policy file (.npz)"))
+        raise MissingFile("run directory or policy file", path, f"or choose one of: {', '.join(names())}")
+    raise UnknownChoice("policy", name, (*names(), f"{SHIELDED}NAME", "a run directory", "a policy file (.npz)"))

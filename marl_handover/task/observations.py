@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 from marl_handover.arrays import Array, namespace
-from marl_handover.config import LAYOUTS, require_choice
+from marl_handover.config import LAYOUTS
 from marl_handover.task.rules import Rules
 
 RAW_FIELDS = ("x", "y", "theta", "goal_x", "goal_y", "goal_theta", "previous_arm")
@@ -54,13 +55,21 @@ MARGIN_SLOPE = 2.0
 """The margin, 1 for no error, crosses 0 at an error of epsilon with this slope, and ends at -1."""
 
 
+class Layout(NamedTuple):
+    """An observation layout; ``LAYOUTS.register("NAME")(Layout(...))`` adds one.
+
+    ``observe``: (rules, pose (..., 3), goal (..., 3), previous_arm (...), epsilon_rad) -> (..., size), for numpy and torch alike;
+    ``size``: the vector's length for a number of arms.
+    """
+
+    observe: Callable[[Rules, Array, Array, Array, Array | float], Array]
+    size: Callable[[int], int]
+
+
 def observation_size(layout: str, num_arms: int = 2) -> int:
     """Length of the layout's vector in a cell of ``num_arms``."""
-    require_choice("layout", layout, LAYOUTS)
-    if layout == "relative":
-        return num_arms * len(ARM_FIELDS)
-    previous = 1 if num_arms == 2 else num_arms
-    return len(RAW_FIELDS if layout == "raw" else OBJECT_FIELDS) - 1 + previous
+    size: int = LAYOUTS[layout].size(num_arms)
+    return size
 
 
 def observe(rules: Rules, layout: str, pose: Array, goal: Array, previous_arm: Array, epsilon_rad: Array | float | None = None) -> Array:
@@ -70,7 +79,8 @@ def observe(rules: Rules, layout: str, pose: Array, goal: Array, previous_arm: A
     """
     if not rules.config.previous_arm:
         previous_arm = 0 * previous_arm - 1
-    return _LAYOUTS[layout](rules, pose, goal, previous_arm, rules.epsilon_rad if epsilon_rad is None else epsilon_rad)
+    seen: Array = LAYOUTS[layout].observe(rules, pose, goal, previous_arm, rules.epsilon_rad if epsilon_rad is None else epsilon_rad)
+    return seen
 
 
 def _scaled(rules: Rules, pose: Array) -> list[Array]:
@@ -143,8 +153,10 @@ def _relative(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsil
     return blocks.reshape(*blocks.shape[:-2], -1)
 
 
-_LAYOUTS: dict[str, Callable[[Rules, Array, Array, Array, Array | float], Array]] = {
-    "raw": _raw,
-    "object": _object,
-    "relative": _relative,
-}
+def _previous_size(num_arms: int) -> int:
+    return 1 if num_arms == 2 else num_arms
+
+
+RAW = Layout(_raw, lambda num_arms: len(RAW_FIELDS) - 1 + _previous_size(num_arms))
+OBJECT = Layout(_object, lambda num_arms: len(OBJECT_FIELDS) - 1 + _previous_size(num_arms))
+RELATIVE = Layout(_relative, lambda num_arms: num_arms * len(ARM_FIELDS))

@@ -13,7 +13,7 @@ from marl_handover.learning.checkpoint import policy_arrays, run_arrays, save_po
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.learning.trainer import Trainer
 from marl_handover.policies import RandomPolicy
-from marl_handover.policies.discrete import DiscretePolicy
+from marl_handover.policies.actor import DiscretePolicy
 from marl_handover.task.episode import play
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Outcome

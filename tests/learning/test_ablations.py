@@ -18,7 +18,7 @@ from marl_handover.learning.evaluation import evaluate, random_problems
 from marl_handover.learning.trainer import Trainer
 from marl_handover.learning.variant import make_variant
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.policies.baselines import ExactPolicy
+from marl_handover.policies.registry import ExactPolicy
 from marl_handover.task.observations import ARM_FIELDS, RAW_FIELDS, observe
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules

@@ -20,7 +20,7 @@ from marl_handover.learning.checkpoint import policy_arrays, run_arrays, save_po
 from marl_handover.learning.evaluation import evaluate
 from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.learning.trainer import Trainer
-from marl_handover.policies import decentralised
+from marl_handover.policies import actor as actors
 from marl_handover.policies.policy import NobodyMoves
 from marl_handover.task.episode import nobody_moves, play
 from marl_handover.task.observations import observe
@@ -177,5 +177,5 @@ print(load({str(made("independent")[1])!r}).act(*__import__("numpy").array([[0.0
 
 def test_branches_have_one_order(paper):
     """Policies repeat three numbers of the networks, since those need torch."""
-    assert (decentralised.FINISH, decentralised.PASS, decentralised.PLACE) == (FINISH, PASS, PLACE)
+    assert (actors.FINISH, actors.PASS, actors.PLACE) == (FINISH, PASS, PLACE)
     assert TurnRules(paper, compose(TrainConfig, []).task, DecentralisedConfig()).action_size == 3
