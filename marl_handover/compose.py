@@ -83,7 +83,7 @@ def compose(
         overrides: ``key=value`` texts, in any order.
         groups: dotted key -> option name -> dataclass, for options that are code. Each such dataclass has a field ``name`` whose default is
             the option's name, so that a written configuration says which option it holds.
-        aliases: short key -> dotted key, such as ``{"epsilon_deg": "task.epsilon_deg"}``.
+        aliases: short key -> dotted key, such as ``{"architecture": "task.architecture"}``.
         configs: folder of ``<group>/<name>.yaml`` and ``preset/<name>.yaml``; the shipped one unless given.
 
     Raises:
@@ -233,23 +233,18 @@ class _Composer:
 
     def assign_tree(self, keys: Keys, tree: Mapping[Any, Any], file: Path | None) -> None:
         """Merge a nested mapping below ``keys``."""
-        if self.stored:
-            tree = self._present(keys, tree)
         name = tree.get("name")
         if keys in self.groups and isinstance(name, str):
+            if self.stored:
+                name = RENAMED_OPTIONS.get((".".join(keys), name), name)
+                tree = {**tree, "name": name}
             self._choose(keys, _Choice(name, file))
+        if self.stored:
+            names = self.tree.names(keys)
+            tree = {RENAMED[key] if key not in names and RENAMED.get(key) in names else key: value for key, value in tree.items()}
         for key, value in tree.items():
             path = (*keys, str(key))
             self._assign(path, value, f"{'.'.join(path)}={value}", file)
-
-    def _present(self, keys: Keys, tree: Mapping[Any, Any]) -> dict[Any, Any]:
-        """A stored mapping with the names that keys and options have now."""
-        section = ".".join(keys)
-        if keys in self.groups and (section, tree.get("name")) in RENAMED_OPTIONS:
-            tree = {**tree, "name": RENAMED_OPTIONS[section, tree["name"]]}
-            self._choose(keys, _Choice(tree["name"]))
-        names = self.tree.names(keys)
-        return {RENAMED[key] if key not in names and RENAMED.get(key) in names else key: value for key, value in tree.items()}
 
     def _is_section(self, keys: Keys) -> bool:
         return keys in self.groups or (self.tree.has(keys) and is_dataclass(without_none(self.tree.kind(keys))))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from marl_handover.errors import HandoverError
 from marl_handover.experiments.tables import expected_lines
-from marl_handover.report.table import read_json
+from marl_handover.parsing import read_json
 
 STORED = Path(__file__).resolve().parents[1] / "bench" / "results" / "compare" / "seeds" / "results.json"
 
