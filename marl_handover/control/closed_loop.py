@@ -35,7 +35,7 @@ from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import OutOfArmsReach, TransferMotion
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.task.episode import nobody_moves
+from marl_handover.task.episode import conclude, measured_verdict, nobody_moves
 from marl_handover.task.rules import Outcome, Rules, Verdict
 
 Floats = NDArray[np.float64]
@@ -103,7 +103,7 @@ class ClosedLoop:
     The *first verdict* is the rule book's, at the first final placement (architecture B) or the first external finish (A), at
     ``max_steps`` transfers at the latest. A transfer that the arm or the backend refuses is a wrong position. After any other verdict than
     success the loop tries again, with the object where it lies, until the object is at the goal or ``settings.transfers`` are spent. It is
-    *stuck* if the object has tipped over or stays out of sight, if an arm does nothing time and again, or if an order is refused and then
+    *stuck* if the object has tipped over or stays out of sight, if an arm does nothing time and again, or if a command is refused and then
     given again about an object that has not moved.
 
     Args:
@@ -172,18 +172,18 @@ class ClosedLoop:
         return run.ended is None
 
     def _decide(self, run: _Run) -> None:
-        """One decision: the policy's order and, in architecture A, the final transfer of an object that can be finished."""
+        """One decision: the policy's command and, in architecture A, the final transfer of an object that can be finished."""
         if self._finish(run):
             return
         self._command(run)
         if run.ended is not None or run.transfers[-1].terminated or len(run.transfers) >= self._room(run):
             return
-        if self._finish(run):  # the reward stands with the order
+        if self._finish(run):  # the reward stands with the command
             command, external = run.transfers[-2:]
             run.transfers[-2:] = replace(command, reward=command.reward + 1 + external.reward), replace(external, reward=0.0)
 
     def _command(self, run: _Run) -> None:
-        """Ask the policy and have its order carried out."""
+        """Ask the policy and have its command carried out."""
         rules, seen = self.rules, self._seen(run)
         action = self.policy.act(seen, run.goal, np.asarray(run.previous))
         if bool(nobody_moves(action)):
@@ -191,16 +191,15 @@ class ClosedLoop:
             return
         command = transfer_command(rules, seen, run.goal, action)
         result = self._move(run.pose, command, seen)
-        if rules.external_finish:
-            # An order that the rule book forbids costs a transfer, as on exact arms; an arm that refuses ends the attempt.
-            verdict = REFUSED if command.feasible and not result.tried else rules.external_verdict(result.pose, run.goal, np.int64(NO_ARM))
-        else:
-            verdict = rules.judge(result.pose, run.goal, np.bool_(command.final), np.bool_(result.tried))
+        verdict = measured_verdict(rules, result.pose, run.goal, np.bool_(command.final), np.bool_(result.tried))
+        if rules.external_finish and command.feasible and not result.tried:
+            # A command that the rule book forbids costs a transfer, as on exact arms; an arm that refuses ends the attempt.
+            verdict = REFUSED
         penalty = rules.motion_penalty(np.int64(command.arm), run.pose, result.pose)
         self._record(run, command, result, verdict._replace(reward=verdict.reward - penalty))
 
     def _wait(self, run: _Run) -> None:
-        """No arm is to move, now or later: a time-out. The entry has an order to nobody, which nobody carried out."""
+        """No arm is to move, now or later: a time-out. The entry has a command to nobody, which nobody carried out."""
         command = TransferCommand(max(int(run.previous), 0), False, np.zeros(2), run.pose[:2], run.pose, False)
         result = TransferResult(run.pose, Refusal.DECLINED, "the policy wants no arm to move")
         self._record(run, command, result, Verdict(np.float64(0), np.bool_(False), np.int64(Outcome.NONE)))
@@ -208,7 +207,7 @@ class ClosedLoop:
         run.ended = "stuck"
 
     def _finish(self, run: _Run) -> bool:
-        """Architecture A's final transfer, if an arm can do it; whether it was ordered."""
+        """Architecture A's final transfer, if an arm can do it; whether it was commanded."""
         seen = self._seen(run)
         command = finish_command(self.rules, seen, run.goal)
         if command is None:
@@ -270,9 +269,8 @@ class ClosedLoop:
         there = self._at_goal(run) and last.result.refusal not in (Refusal.TIPPED, Refusal.UNSEEN)
         if run.attempt > 0 and there:
             last = replace(last, terminated=True, outcome=Outcome.SUCCESS)
-        elif not last.terminated and count >= self._room(run):
-            last = replace(last, truncated=True, outcome=Outcome.TIMEOUT)
-        run.transfers[-1] = last
+        truncated, outcome = conclude(np.bool_(last.terminated), np.int64(last.outcome), count, self._room(run))
+        run.transfers[-1] = last = replace(last, truncated=bool(truncated), outcome=Outcome(int(outcome)))
         if there and last.over:
             run.ended = "success"
         elif last.result.refusal in HOPELESS or (run.attempt > 0 and last.repeats(run.transfers[-2], *self._same)):

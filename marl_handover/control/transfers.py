@@ -15,7 +15,7 @@ from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.envs.cycle_check import FAILURES
 from marl_handover.learning.evaluation import judged_by
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.task.episode import advance
+from marl_handover.task.episode import advance, final_transfer
 from marl_handover.task.rules import Outcome, Rules
 
 Floats = NDArray[np.float64]
@@ -30,7 +30,7 @@ def moved(before: Floats, after: Floats, same_mm: float = SAME_MM, same_rad: flo
 
 
 class TransferResult(NamedTuple):
-    """What came of an order to an arm.
+    """What came of a command to an arm.
 
     ``pose`` (3,) measured afterwards; ``refusal``: a value of :class:`~marl_handover.envs.cycle_check.Refusal`, or None;
     ``detail``: the arm's words about it; ``planning_ms``; ``duration_s`` and ``path_mm`` of the motion, 0 if there was none;
@@ -80,7 +80,7 @@ class TransferCommand(NamedTuple):
 
 
 def transfer_command(rules: Rules, pose: Floats, goal: Floats, action: Floats) -> TransferCommand:
-    """What a supervisor's ``action`` (4,) orders to be done with an object at ``pose`` (3,), goal (3,)."""
+    """What a supervisor's ``action`` (4,) tells an arm to do with an object at ``pose`` (3,), goal (3,)."""
     command = rules.decode(action)
     predicted, feasible = rules.transfer(pose, goal, command)
     chart = np.array(rules.cell.chart.from_table(command.place_mm), float)
@@ -90,10 +90,8 @@ def transfer_command(rules: Rules, pose: Floats, goal: Floats, action: Floats) -
 
 def finish_command(rules: Rules, pose: Floats, goal: Floats) -> TransferCommand | None:
     """Architecture A's final transfer of an object at ``pose`` (3,), if an arm can do it; None in architecture B."""
-    if not rules.external_finish:
-        return None
-    external = rules.external(pose, goal)
-    return TransferCommand(int(external.arm), True, np.zeros(2), goal[:2], external.pose, True) if external.arm >= 0 else None
+    external = final_transfer(rules, pose, goal)
+    return None if external is None else TransferCommand(int(external.arm), True, np.zeros(2), goal[:2], external.pose, True)
 
 
 @dataclass(frozen=True)
@@ -103,10 +101,10 @@ class Transfer:
     Attributes:
         attempt: 0 up to the first verdict; every later verdict counts one on.
         goal: (3,) at the time.
-        order: what the arm was told.
+        command: what the arm was told.
         before: (3,) measured pose.
         previous_arm: index, -1 for none.
-        done: what came of it.
+        result: what came of it.
         reward: r_A or r_B.
         terminated, truncated: whether its attempt ends here, by verdict or for want of transfers.
         outcome: NONE while the attempt goes on.

@@ -26,6 +26,7 @@ from marl_handover.envs.problem_source import ProblemSource
 from marl_handover.envs.spaces import SUPERVISOR, Spaces, read_command, read_cycle
 from marl_handover.motion.executor import ARM_AGENTS
 from marl_handover.motion.path_length_table import motion_cost
+from marl_handover.task.episode import conclude, final_transfer, measured_verdict
 from marl_handover.task.rules import Command, Outcome, Rules, Verdict
 
 Floats = NDArray[np.float64]
@@ -146,7 +147,7 @@ class HandoverEnv(AECEnv):
         self._outcome = Outcome.NONE
         self._place_mm: Floats | None = None
         # Solved at its start: the supervisor's first action is ignored.
-        self._early = self._external() if self.rules.external_finish else None
+        self._early = self._external()
         self.agents = self.possible_agents[:]
         self.rewards = dict.fromkeys(self.agents, 0.0)
         self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
@@ -251,18 +252,18 @@ class HandoverEnv(AECEnv):
         self._penalty = float(rules.motion_penalty(command.arm, self._pose, placed))
         self._moved(placed, command.arm if feasible else self._previous)
         tipped = refusal == Refusal.TIPPED
-        external = self._external() if rules.external_finish and not tipped and self._transfers < rules.config.max_steps else None
+        external = self._external() if not tipped and self._transfers < rules.config.max_steps else None
         if external is not None:
             self._ask(external)
-        elif rules.external_finish:
-            self._conclude(TIPPED_OVER if tipped else rules.external_verdict(placed, self._goal, np.int64(-1)), refusal)
+        elif rules.external_finish and tipped:
+            self._conclude(TIPPED_OVER, refusal)
         else:
-            self._conclude(rules.judge(placed, self._goal, command.final, feasible), refusal)
+            self._conclude(measured_verdict(rules, placed, self._goal, command.final, feasible), refusal)
 
     def _external(self) -> Turn | None:
         """Architecture A's final transfer of the object as it lies, if an arm can do it."""
-        external = self.rules.external(self._pose, self._goal)
-        return None if external.arm < 0 else Turn(int(external.arm), self._goal[:2], external.pose, True, None)
+        external = final_transfer(self.rules, self._pose, self._goal)
+        return None if external is None else Turn(int(external.arm), self._goal[:2], external.pose, True, None)
 
     def _finish(self, turn: Turn, placed: Floats, refusal: str | None) -> None:
         """Judge architecture A's final transfer."""
@@ -276,13 +277,12 @@ class HandoverEnv(AECEnv):
 
     def _conclude(self, verdict: Verdict, refusal: str | None) -> None:
         """End the supervisor's decision, and the episode if that is due."""
-        terminated = bool(verdict.terminated)
-        truncated = not terminated and self._transfers >= self.rules.config.max_steps
-        self._outcome = Outcome.TIMEOUT if truncated else Outcome(int(verdict.outcome))
+        truncated, outcome = conclude(verdict.terminated, verdict.outcome, self._transfers, self.rules.config.max_steps)
+        self._outcome = Outcome(int(outcome))
         self.rewards[SUPERVISOR] = float(verdict.reward) - self._penalty
         self._penalty = 0.0
-        self.terminations = dict.fromkeys(self.agents, terminated)
-        self.truncations = dict.fromkeys(self.agents, truncated)
+        self.terminations = dict.fromkeys(self.agents, bool(verdict.terminated))
+        self.truncations = dict.fromkeys(self.agents, bool(truncated))
         self.infos[SUPERVISOR] = {"refusal": refusal, "transfers": self._transfers, "outcome": self._outcome.name.lower()}
         self.agent_selection = SUPERVISOR
 

@@ -19,7 +19,7 @@ from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.errors import CorruptFile, NotFinite, OutOfReach
 from marl_handover.files import read_bounded
 from marl_handover.parsing import LINES_BYTES, parse_object
-from marl_handover.task.episode import Act, Decision, Episodes, Noise, Observer, play
+from marl_handover.task.episode import Act, Decision, Episodes, Noise, Observer, conclude, play
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules, carried
@@ -227,9 +227,9 @@ class Trace:
             return None
         final = bool(result.command.final[row])
         place = decision.goal[row, :2] if final else result.command.place_mm[row]
-        terminated = bool(result.terminated[row])
-        truncated = not terminated and int(decision.made[row] + result.transfers[row]) >= self.rules.config.max_steps
-        outcome = Outcome.TIMEOUT if truncated else Outcome(int(result.outcome[row]))
+        terminated, made = bool(result.terminated[row]), decision.made[row] + result.transfers[row]
+        truncated, ended = conclude(result.terminated[row], result.outcome[row], made, self.rules.config.max_steps)
+        outcome = Outcome(int(ended))
         return {
             **self._problem(decision, row, decision.pose[row], int(decision.previous_arm[row])),
             "arm": ARM_LETTERS[int(result.command.arm[row])],
@@ -240,7 +240,7 @@ class Trace:
             "next_state": result.placed[row].tolist(),
             "reward": float(result.reward[row]),
             "terminated": terminated and not external,
-            "truncated": truncated,
+            "truncated": bool(truncated),
             "outcome": None if external or outcome is Outcome.NONE else outcome.name.lower(),
             **judged_by(self.rules),
         }

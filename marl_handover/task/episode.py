@@ -2,6 +2,9 @@
 
 :func:`advance` takes a decision, counts transfers and tells when an episode is over; :func:`play` does so to the end for a whole batch.
 Environments, plans and what a policy means to do next use the first, evaluation the second.
+
+Where transfers are carried out one by one and measured, an episode takes the same steps: :func:`final_transfer` before and after each
+command, :func:`measured_verdict` of what came of it, :func:`conclude`.
 """
 
 from __future__ import annotations
@@ -9,8 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from marl_handover.arrays import Array, namespace
-from marl_handover.task.rules import Outcome, Rules, Transition
+from marl_handover.cell.symmetry import NO_ARM
+from marl_handover.task.rules import External, Outcome, Rules, Transition, Verdict
 
 Act = Callable[[Array, Array, Array], Array]
 """pose (n, 3), goal (n, 3), previous_arm (n,) -> action (n, 4); a row that is not a number: no arm moves."""
@@ -90,8 +96,29 @@ def advance(
     if may_wait:
         idle = nobody_moves(action) & (result.external_arm < 0)
         result, total = _without(result, idle), xp.where(idle, limit, total)
-    truncated = ~result.terminated & (total >= limit)
-    return Stepped(result, total, truncated, xp.where(truncated, int(Outcome.TIMEOUT), result.outcome), idle)
+    return Stepped(result, total, *conclude(result.terminated, result.outcome, total, limit), idle)
+
+
+def conclude(terminated: Array, outcome: Array, made: Array | int, limit: int) -> tuple[Array, Array]:
+    """Whether episodes (...) with ``made`` of ``limit`` transfers end here for want of more, without a verdict; and the outcome then."""
+    truncated = ~terminated & (made >= limit)
+    return truncated, namespace(outcome).where(truncated, int(Outcome.TIMEOUT), outcome)
+
+
+def final_transfer(rules: Rules, pose: Array, goal: Array) -> External | None:
+    """Architecture A's final transfer of an object at ``pose`` (3,), goal (3,), if an arm can do it; None in architecture B."""
+    external = rules.external(pose, goal) if rules.external_finish else None
+    return None if external is None or external.arm < 0 else external
+
+
+def measured_verdict(rules: Rules, placed: Array, goal: Array, final: Array, tried: Array) -> Verdict:
+    """The verdict on a commanded transfer after which the object was measured at ``placed`` (3,); in architecture A there is none yet.
+
+    ``final``: whether it was to end the episode; ``tried``: whether it took place, well or badly.
+    """
+    if rules.external_finish:
+        return rules.external_verdict(placed, goal, np.int64(NO_ARM))
+    return rules.judge(placed, goal, final, tried)
 
 
 def play(
