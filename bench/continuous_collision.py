@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from marl_handover.compiled import compiled
 from marl_handover.motion.collision_model import Scene
+from marl_handover.motion.objective import dense_margins
 from marl_handover.motion.path_optimizer import Segment
 from marl_handover.motion.trajectory import knots
-from marl_handover.motion.validation import dense_margins
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -23,9 +23,7 @@ from marl_handover.control.transfers import (
     Transfer,
     TransferCommand,
     TransferResult,
-    finish_command,
     moved,
-    transfer_command,
 )
 from marl_handover.envs.backends import Backend, make_backend
 from marl_handover.envs.cycle_check import Refusal
@@ -35,7 +33,7 @@ from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import OutOfArmsReach, TransferMotion
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.task.episode import conclude, measured_verdict, nobody_moves
+from marl_handover.task.episode import conclude, final_transfer, measured_verdict, nobody_moves
 from marl_handover.task.rules import Outcome, Rules, Verdict
 
 Floats = NDArray[np.float64]
@@ -284,6 +282,21 @@ class ClosedLoop:
         """Whether the object lies at the goal, whoever put it there."""
         verdict = self.rules.external_verdict(run.pose, run.goal, np.int64(run.transfers[-1].command.arm))
         return int(verdict.outcome) == Outcome.SUCCESS
+
+
+def transfer_command(rules: Rules, pose: Floats, goal: Floats, action: Floats) -> TransferCommand:
+    """What a supervisor's ``action`` (4,) tells an arm to do with an object at ``pose`` (3,), goal (3,)."""
+    command = rules.decode(action)
+    predicted, feasible = rules.transfer(pose, goal, command)
+    chart = np.array(rules.cell.chart.from_table(command.place_mm), float)
+    target = goal[:2] if command.final else command.place_mm
+    return TransferCommand(int(command.arm), bool(command.final), chart, target, predicted, bool(feasible))
+
+
+def finish_command(rules: Rules, pose: Floats, goal: Floats) -> TransferCommand | None:
+    """Architecture A's final transfer of an object at ``pose`` (3,), if an arm can do it; None in architecture B."""
+    external = final_transfer(rules, pose, goal)
+    return None if external is None else TransferCommand(int(external.arm), True, np.zeros(2), goal[:2], external.pose, True)
 
 
 def make_loop(

@@ -15,7 +15,7 @@ from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.envs.cycle_check import FAILURES
 from marl_handover.learning.evaluation import judged_by
 from marl_handover.policies import SupervisorPolicy
-from marl_handover.task.episode import advance, final_transfer
+from marl_handover.task.episode import advance
 from marl_handover.task.rules import Outcome, Rules
 
 Floats = NDArray[np.float64]
@@ -77,21 +77,6 @@ class TransferCommand(NamedTuple):
     place_mm: Floats
     predicted: Floats
     feasible: bool
-
-
-def transfer_command(rules: Rules, pose: Floats, goal: Floats, action: Floats) -> TransferCommand:
-    """What a supervisor's ``action`` (4,) tells an arm to do with an object at ``pose`` (3,), goal (3,)."""
-    command = rules.decode(action)
-    predicted, feasible = rules.transfer(pose, goal, command)
-    chart = np.array(rules.cell.chart.from_table(command.place_mm), float)
-    target = goal[:2] if command.final else command.place_mm
-    return TransferCommand(int(command.arm), bool(command.final), chart, target, predicted, bool(feasible))
-
-
-def finish_command(rules: Rules, pose: Floats, goal: Floats) -> TransferCommand | None:
-    """Architecture A's final transfer of an object at ``pose`` (3,), if an arm can do it; None in architecture B."""
-    external = final_transfer(rules, pose, goal)
-    return None if external is None else TransferCommand(int(external.arm), True, np.zeros(2), goal[:2], external.pose, True)
 
 
 @dataclass(frozen=True)

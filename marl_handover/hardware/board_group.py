@@ -13,10 +13,9 @@ from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.errors import BadCommand, BoardReset, PortLost, TooSlow, WrongState
-from marl_handover.hardware.protocol import PULSE_US, READING_US, SPEED_US_S, TIME_MS, group_move, stop
 from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason
-from marl_handover.hardware.settings import ARMS, GripperConfig, HardwareConfig
-from marl_handover.hardware.ssc32 import LineRecord, Ssc32
+from marl_handover.hardware.settings import ARMS, PULSE_US, READING_US, SPEED_US_S, TIME_MS, GripperConfig, HardwareConfig
+from marl_handover.hardware.ssc32 import LineRecord, Ssc32, group_move, stop
 from marl_handover.hardware.transport import BITS_PER_BYTE
 
 Floats = NDArray[np.float64]

@@ -23,8 +23,7 @@ from marl_handover.errors import CorruptFile, HandoverError, MissingFile
 from marl_handover.files import keep, make_folder, read_bounded, write_together, write_whole
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.hardware.protocol import PULSE_US
-from marl_handover.hardware.settings import ARMS, GripperConfig, HardwareConfig
+from marl_handover.hardware.settings import ARMS, PULSE_US, GripperConfig, HardwareConfig
 from marl_handover.parsing import JSON_BYTES, read_json
 
 Floats = NDArray[np.float64]

@@ -28,9 +28,10 @@ from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.connection import FILTER_OFF, ArmConnection, State
 from marl_handover.hardware.errors import BadCommand, HalfHeld, NotConfirmed, WrongState
 from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.expected_pulses import SETTLED_S
 from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.hardware.settings import ARMS, HardwareConfig
-from marl_handover.hardware.ssc32 import SETTLED_S, LineRecord
+from marl_handover.hardware.ssc32 import LineRecord
 
 Floats = NDArray[np.float64]
 

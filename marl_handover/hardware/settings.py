@@ -13,8 +13,17 @@ from dataclasses import dataclass, field
 from marl_handover.config import bounded, check_bounds, chosen, name_field, path_field, seed_field
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.hardware.protocol import BAUDS, CHANNELS, PULSE_US
 from marl_handover.hardware.session_registry import user_path
+
+CHANNELS = 32
+PULSE_US = (500, 2500)
+READING_US = 10
+"""A pulse as boards tell it stands for any from itself to less than this above."""
+
+SPEED_US_S = (1, 65535)
+TIME_MS = (1, 65535)
+BAUDS = (115200, 38400, 9600, 2400)
+"""Rates of the boards' jumpers or button; 9600 is what an SSC-32U comes with, 115200 is what stopping in time needs."""
 
 FIRST_MOVES = ("ask", "refuse")
 ON_DISCONNECT = ("hold", "limp", "park")

@@ -1,26 +1,194 @@
-"""One controller board over its wire: handshake, queries that are checked, moves that are safe to send."""
+"""SSC-32 and SSC-32U servo controllers: their language, and one board over its wire, with checked queries and moves that are safe to send.
+
+Lines are ASCII and end in CR. Moves are never acknowledged, bad lines are dropped in silence, and a pulse beyond its limits is clamped, so
+everything is checked here before it is sent. Source: Lynxmotion's SSC-32U user guide (pages 24-39) and what users measured, as collected in
+the design notes. ``T`` is in milliseconds (the guide says microseconds once; its examples say otherwise).
+"""
 
 from __future__ import annotations
 
+import re
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from math import ceil, inf
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from numbers import Integral
+from typing import Any, NamedTuple, TypeVar
 
-from marl_handover.hardware import protocol
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.errors import (
+    BadCommand,
     BadReply,
     BoardReset,
     BoardSilent,
+    DuplicateChannel,
+    LineTooLong,
+    MixedCommands,
     NoReference,
     PortLost,
     PulseMismatch,
     UnsuitableFirmware,
     WrongState,
 )
-from marl_handover.hardware.settings import BoardConfig, StreamConfig, TimeoutConfig
-from marl_handover.hardware.transport import Logged, Wire, choose_port
+from marl_handover.hardware.expected_pulses import ExpectedPulses, PulseRange
+from marl_handover.hardware.settings import (
+    BAUDS,
+    CHANNELS,
+    PULSE_US,
+    READING_US,
+    SPEED_US_S,
+    TIME_MS,
+    BoardConfig,
+    StreamConfig,
+    TimeoutConfig,
+)
+from marl_handover.hardware.transport import CANCEL, Logged, Wire, choose_port
+
+MAX_LINE_BYTES = 256
+"""No buffer size is published; this fits positions of all 32 channels with a time, and no driver in use sends longer lines."""
+
+CR = b"\r"
+QUERY = b"Q\r"
+VERSION = b"VER\r"
+
+MAX_VERSION_BYTES = 64
+_FIRMWARE = re.compile(r"SSC32-V(\d+)\.(\d+)(\w*)")
+
+
+@dataclass(frozen=True)
+class Move:
+    """Go to ``pulse_us``, not faster than ``speed_us_s`` if that is given."""
+
+    channel: int
+    pulse_us: int
+    speed_us_s: int | None = None
+
+
+@dataclass(frozen=True)
+class Level:
+    """Stop the pulses of a channel and hold its pin high or low. Low is how a servo is let go limp."""
+
+    channel: int
+    high: bool
+
+
+BoardCommand = Move | Level
+
+
+@dataclass(frozen=True)
+class Firmware:
+    """What ``VER`` said. ``number`` orders firmwares: (2, 50) for V2.50."""
+
+    text: str
+    number: tuple[int, int]
+    suffix: str
+
+    @property
+    def has_stop(self) -> bool:
+        """Whether ``STOP`` exists: from V2.01 on."""
+        return self.number >= (2, 1)
+
+
+def encode_line(commands: Sequence[BoardCommand], time_ms: int | None = None) -> bytes:
+    """One line for commands of one type; ``time_ms`` goes with moves only. Moves in one line begin and end together.
+
+    Raises:
+        BadCommand: a value is out of its limits, or no whole number.
+        DuplicateChannel, MixedCommands, LineTooLong: as they say.
+    """
+    kinds = {type(command) for command in commands}
+    if not commands or not kinds <= {Move, Level}:
+        raise BadCommand("commands", [type(command).__name__ for command in commands], "at least one Move or Level")
+    if len(kinds) > 1:
+        raise MixedCommands(kind.__name__ for kind in kinds)
+    _require_distinct(command.channel for command in commands)
+    text = "".join(_encoded(command) for command in commands)
+    if time_ms is not None:
+        if kinds != {Move}:
+            raise BadCommand("time_ms", time_ms, "left out but for moves")
+        text += f"T{_whole('time_ms', time_ms, *TIME_MS)}"
+    return _line(text)
+
+
+def group_move(pulses_us: Mapping[int, int], time_ms: int | None = None, speeds_us_s: Mapping[int, int] | None = None) -> bytes:
+    """The line that takes channels to pulses; shorthand for :func:`encode_line` of :class:`Move`."""
+    speeds = speeds_us_s or {}
+    return encode_line([Move(channel, pulse, speeds.get(channel)) for channel, pulse in pulses_us.items()], time_ms)
+
+
+def stop(channels: Iterable[int]) -> bytes:
+    """Lines that stop channels where their moves are now: one short line a channel, so that the first acts while the rest is on its way.
+
+    A fragment of a move that was cut short is dropped first: glued to it, the first stop would not be understood. (Ending the fragment's
+    line instead would carry it out.) ``Q`` goes on saying "moving" until the original time is over.
+    """
+    listed = list(channels)
+    _require_distinct(listed)
+    return CANCEL + b"".join(_line(f"STOP{_channel(channel)}") for channel in listed)
+
+
+def query_pulses(channels: Sequence[int]) -> bytes:
+    """Ask what channels are sent now; :func:`parse_pulses` reads the reply of one byte a channel."""
+    if not channels:
+        raise BadCommand("channels", list(channels), "at least one")
+    return _line("".join(f"QP{_channel(channel)}" for channel in channels))
+
+
+def parse_moving(reply: bytes) -> bool:
+    """Whether the last move goes on, from the one byte that answers ``Q``."""
+    if reply not in (b".", b"+"):
+        raise BadReply("Q", reply, "'.' or '+'")
+    return reply == b"+"
+
+
+def parse_pulses(reply: bytes, count: int) -> tuple[int | None, ...]:
+    """Pulses in us, to 10 us, of ``count`` channels; None where the board sends none and so knows no position."""
+    if len(reply) != count or any(byte != 0 and not 50 <= byte <= 250 for byte in reply):
+        raise BadReply("QP", reply, f"{count} bytes, each 0 or 50 to 250")
+    return tuple(10 * byte or None for byte in reply)
+
+
+def parse_version(reply: bytes) -> Firmware:
+    """What answers ``VER``. Raises :class:`BadReply` for anything that is no SSC-32's."""
+    text = reply.decode("ascii", "replace").strip()
+    match = _FIRMWARE.search(text)
+    if match is None or len(reply) > MAX_VERSION_BYTES:
+        raise BadReply("VER", reply, "SSC32-V and a number: other boards answer in another style")
+    return Firmware(match[0], (int(match[1]), int(match[2])), match[3])
+
+
+def _encoded(command: BoardCommand) -> str:
+    head = f"#{_channel(command.channel)}"
+    if isinstance(command, Move):
+        speed = "" if command.speed_us_s is None else f"S{_whole('speed_us_s', command.speed_us_s, *SPEED_US_S)}"
+        return f"{head}P{_whole('pulse_us', command.pulse_us, *PULSE_US)}{speed}"
+    return head + ("H" if command.high else "L")
+
+
+def _channel(channel: Any) -> int:
+    return _whole("channel", channel, 0, CHANNELS - 1)
+
+
+def _whole(name: str, value: Any, low: int, high: int) -> int:
+    """``value`` as an int. NaN, text, truth values and fractions are refused: a number that had to be guessed at would move an arm."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or not low <= int(value) <= high:
+        raise BadCommand(name, value, f"a whole number, {low} to {high}")
+    return int(value)
+
+
+def _require_distinct(channels: Iterable[int]) -> None:
+    seen: set[int] = set()
+    for channel in channels:
+        if channel in seen:
+            raise DuplicateChannel(channel)
+        seen.add(channel)
+
+
+def _line(text: str) -> bytes:
+    line = text.encode("ascii") + CR
+    if len(line) > MAX_LINE_BYTES:
+        raise LineTooLong(len(line), MAX_LINE_BYTES)
+    return line
+
 
 T = TypeVar("T")
 
@@ -65,7 +233,7 @@ class Ssc32:
         on_wait: Callable[[], object] = lambda: None,
     ) -> None:
         self.name, self.config, self.dry_run = name, config, dry_run
-        self.firmware: protocol.Firmware | None = None
+        self.firmware: Firmware | None = None
         self._timeouts, self._clock = timeouts, clock
         self._log: deque[Logged] = deque(maxlen=log_entries)
         self._wire: Wire | None = None
@@ -89,7 +257,7 @@ class Ssc32:
         """Every byte with its time, as far back as the log goes, whatever became of the port meanwhile."""
         return list(self._log)
 
-    def connect(self) -> protocol.Firmware:
+    def connect(self) -> Firmware:
         """Open the port and find the board on it, trying other rates if allowed; every channel counts as never moved.
 
         Raises:
@@ -129,7 +297,7 @@ class Ssc32:
 
     def moving(self) -> bool:
         """Whether the last move's time is not over. It says nothing of servos that were stopped, and some boards get stuck on True."""
-        return self._asked(protocol.QUERY, 1, protocol.parse_moving)
+        return self._asked(QUERY, 1, parse_moving)
 
     def require_pulses(self, channels: Iterable[int], tolerance_us: float = StreamConfig.pulse_tolerance_us) -> None:
         """Ask whether channels put out what they were sent by now.
@@ -164,7 +332,7 @@ class Ssc32:
     def note_readback(self, pulses_us: Mapping[int, int]) -> None:
         """Take readings of channels that stand still for what they put out, whatever they were sent before."""
         for channel, pulse in pulses_us.items():
-            self._expected.hold(channel, PulseRange(pulse, pulse + protocol.READING_US))
+            self._expected.hold(channel, PulseRange(pulse, pulse + READING_US))
 
     def referenced(self, channels: Iterable[int]) -> bool:
         """Whether the first move of all these channels is done."""
@@ -186,7 +354,7 @@ class Ssc32:
     def stop(self, channels: Iterable[int]) -> LineRecord:
         """Stop channels where they are. Written even in a dry run."""
         listed = list(channels)
-        data = protocol.stop(listed)
+        data = stop(listed)
         written_s = self.wire.write(data)
         self._expected.stop(listed, written_s, self._clock.now_s() + self.wire.backlog_s())
         return LineRecord(self.name, written_s, data, True)
@@ -196,10 +364,10 @@ class Ssc32:
         listed = list(channels)
         self._known.difference_update(listed)
         self._expected.forget(listed)
-        return self._send(protocol.encode_line([protocol.Level(channel, False) for channel in listed]))
+        return self._send(encode_line([Level(channel, False) for channel in listed]))
 
     def _pulses_once(self, listed: list[int]) -> dict[int, int | None]:
-        answer = self._asked(protocol.query_pulses(listed), len(listed), lambda reply: protocol.parse_pulses(reply, len(listed)))
+        answer = self._asked(query_pulses(listed), len(listed), lambda reply: parse_pulses(reply, len(listed)))
         return dict(zip(listed, answer, strict=True))
 
     def _astray(self, found: Mapping[int, int | None], taken_s: tuple[float, float], tolerance_us: float) -> PulseMismatch | None:
@@ -208,7 +376,7 @@ class Ssc32:
             span = self._expected.span(channel, *taken_s)
             if span is None or pulse is None:
                 continue
-            if not span.lower - protocol.READING_US - tolerance_us <= pulse <= span.upper + tolerance_us:
+            if not span.lower - READING_US - tolerance_us <= pulse <= span.upper + tolerance_us:
                 return PulseMismatch(self.name, channel, pulse, span, tolerance_us)
         return None
 
@@ -218,7 +386,7 @@ class Ssc32:
         self._expected.forget()
 
     def _send_move(self, pulses_us: Mapping[int, int], time_ms: int | None, speeds_us_s: Mapping[int, int]) -> LineRecord:
-        sent = self._send(protocol.group_move(pulses_us, time_ms, speeds_us_s))
+        sent = self._send(group_move(pulses_us, time_ms, speeds_us_s))
         if sent.written:
             heard_s = self._clock.now_s() + self.wire.backlog_s()
             self._expected.move(pulses_us, (time_ms or 0) / 1000, speeds_us_s, sent.t_s, heard_s)
@@ -229,11 +397,11 @@ class Ssc32:
             return LineRecord(self.name, self.wire.note_held_back(line), line, False)
         return LineRecord(self.name, self.wire.write(line), line, True)
 
-    def _handshake(self, wire: Wire) -> protocol.Firmware:
+    def _handshake(self, wire: Wire) -> Firmware:
         """The firmware; the wire is left at the rate at which it answered."""
         bauds = [self.config.baud]
         if self.config.scan:
-            bauds += [baud for baud in protocol.BAUDS if baud != self.config.baud]
+            bauds += [baud for baud in BAUDS if baud != self.config.baud]
         odd = b""
         for baud in bauds:
             wire.set_baud(baud)
@@ -270,12 +438,12 @@ class Ssc32:
         raise PortLost(self.wire.port, "asking the board", "it no longer answers")
 
 
-def _version(wire: Wire, on_wait: Callable[[], object] | None = None) -> tuple[protocol.Firmware | None, bytes]:
+def _version(wire: Wire, on_wait: Callable[[], object] | None = None) -> tuple[Firmware | None, bytes]:
     """What a board says that it is, None if that is no SSC-32, and the answer itself."""
     # An old fragment would glue itself to the question; a board that is just starting may miss the first one.
-    reply = wire.ask(protocol.CANCEL + protocol.VERSION, protocol.MAX_VERSION_BYTES, until=protocol.CR, on_wait=on_wait)
+    reply = wire.ask(CANCEL + VERSION, MAX_VERSION_BYTES, until=CR, on_wait=on_wait)
     try:
-        firmware = protocol.parse_version(reply)
+        firmware = parse_version(reply)
     except BadReply:
         return None, reply
     wire.drain(QUIET_S, on_wait)  # some say more on a second line
@@ -287,140 +455,3 @@ def _same(before: int | None, now: int | None) -> bool:
     if before is None or now is None:
         return before is now
     return abs(before - now) <= MOVED_US
-
-
-FRAME_S = 0.02
-"""Boards change their pulses at this interval, and move in whole ones."""
-
-LATE_S = 0.03
-"""A board begins a move at most so long after its line came in: one frame, and half of one for the computer's own delays."""
-
-SETTLED_S = 0.08
-"""A board is done with a move so long after its time is over, at the latest; its line's own way included."""
-
-_RAMPS = 16
-"""More moves than fit on a line while a board may be late."""
-
-
-class PulseRange(NamedTuple):
-    """Everything from ``lower`` to ``upper``, in us."""
-
-    lower: float
-    upper: float
-
-    def joined(self, other: PulseRange) -> PulseRange:
-        """The smallest span that holds both."""
-        return PulseRange(min(self.lower, other.lower), max(self.upper, other.upper))
-
-
-class _Ramp(NamedTuple):
-    """Straight from one pulse to another; there before and after. It began ``doubt_us`` beside ``start_us`` at most."""
-
-    start_us: float
-    end_us: float
-    begin_s: float
-    end_s: float
-    doubt_us: float = 0.0
-
-    def at(self, t_s: float) -> float:
-        """The pulse at a time."""
-        return self.end_us + self._left(t_s) * (self.start_us - self.end_us)
-
-    def doubt(self, t_s: float) -> float:
-        """How far beside it the channel may be at a time, in us."""
-        return self._left(t_s) * self.doubt_us
-
-    def speed_us_s(self, t_s: float) -> float:
-        """Change of the pulse at a time."""
-        return (self.end_us - self.start_us) / (self.end_s - self.begin_s) if self.begin_s <= t_s < self.end_s else 0.0
-
-    def _left(self, t_s: float) -> float:
-        """The share that is still to go."""
-        if self.end_s == inf:
-            return 1.0
-        return 0.0 if t_s >= self.end_s or self.end_s <= self.begin_s else min((self.end_s - t_s) / (self.end_s - self.begin_s), 1.0)
-
-
-class _Channel:
-    """One channel as one board would move it: its last ways, each of which cuts off the one before."""
-
-    def __init__(self, pulse_us: float, doubt_us: float = 0.0) -> None:
-        self._ramps = deque([_Ramp(pulse_us, pulse_us, -inf, inf, doubt_us)], maxlen=_RAMPS)
-
-    def at(self, t_s: float) -> float:
-        """The pulse at a time."""
-        return self._ramp(t_s).at(t_s)
-
-    def distance(self, pulse_us: float, t_s: float) -> float:
-        """How far it may have to a pulse at a time, at most."""
-        way = self._ramp(t_s)
-        return abs(pulse_us - way.at(t_s)) + way.doubt(t_s)
-
-    def go(self, pulse_us: float, begin_s: float, duration_s: float) -> None:
-        """Turn to another pulse. Where it turned is known to a frame: one of the old speed for one of the new."""
-        before = self._ramp(begin_s)
-        way = _Ramp(before.at(begin_s), pulse_us, begin_s, begin_s + duration_s)
-        doubt_us, old_us_s = before.doubt(begin_s), before.speed_us_s(begin_s)
-        if old_us_s:
-            doubt_us += FRAME_S * abs(old_us_s - way.speed_us_s(begin_s))
-        self._ramps.append(way._replace(doubt_us=doubt_us))
-
-    def range(self, from_s: float, to_s: float) -> PulseRange:
-        """Everything that it may pass between two times."""
-        turns = (t_s for way in self._ramps for t_s in (way.begin_s, way.end_s) if from_s < t_s < to_s)
-        passed = [(self.at(t_s), self._ramp(t_s).doubt(t_s)) for t_s in (from_s, to_s, *turns)]
-        return PulseRange(min(pulse - doubt for pulse, doubt in passed), max(pulse + doubt for pulse, doubt in passed))
-
-    def _ramp(self, t_s: float) -> _Ramp:
-        return next((way for way in reversed(self._ramps) if t_s >= way.begin_s), self._ramps[0])
-
-
-class ExpectedPulses:
-    """The channels of one board. Times are those of the caller's clock.
-
-    When a board acts is known to some frames only. So each channel is reckoned twice: as a board would move it that is as early as can
-    be, and as one that is as late; what it puts out lies between.
-    """
-
-    def __init__(self) -> None:
-        self._channels: dict[int, tuple[_Channel, _Channel]] = {}
-
-    def move(
-        self, pulses_us: Mapping[int, int], duration_s: float, speeds_us_s: Mapping[int, int], written_s: float, heard_s: float
-    ) -> None:
-        """Channels were sent to ``pulses_us`` together, each at most at its speed: written at one time, at the board at another.
-
-        One of which nothing is known jumps there.
-        """
-        for channel, pulse in pulses_us.items():
-            self._channels.setdefault(channel, (_Channel(pulse), _Channel(pulse)))
-        for late, begin_s in enumerate((written_s - FRAME_S, heard_s + LATE_S)):
-            courses = {channel: self._channels[channel][late] for channel in pulses_us}
-            ways_s = (courses[channel].distance(pulses_us[channel], begin_s) / speed for channel, speed in speeds_us_s.items())
-            longest_s = max((duration_s, *ways_s))
-            for channel, pulse in pulses_us.items():
-                courses[channel].go(float(pulse), begin_s, FRAME_S * ceil(longest_s / FRAME_S) if late else longest_s)
-
-    def stop(self, channels: Iterable[int], written_s: float, heard_s: float) -> None:
-        """Channels were told to stay where they are."""
-        for channel in channels:
-            if (span := self.span(channel, written_s, heard_s + LATE_S)) is not None:
-                self.hold(channel, span)
-
-    def hold(self, channel: int, span: PulseRange) -> None:
-        """A channel note_readback still somewhere in ``span``."""
-        middle_us, doubt_us = (span.lower + span.upper) / 2, (span.upper - span.lower) / 2
-        self._channels[channel] = _Channel(middle_us, doubt_us), _Channel(middle_us, doubt_us)
-
-    def forget(self, channels: Iterable[int] | None = None) -> None:
-        """Nothing is known of these channels any more; of none, without any."""
-        for channel in list(self._channels if channels is None else channels):
-            self._channels.pop(channel, None)
-
-    def span(self, channel: int, from_s: float, to_s: float) -> PulseRange | None:
-        """What a channel may put out between two times; None for one that was told nothing."""
-        if channel not in self._channels:
-            return None
-        early, late = self._channels[channel]
-        # A move that was cut off in its first frame may have been carried out for all of that frame, or not at all.
-        return early.range(from_s - LATE_S, to_s).joined(late.range(from_s, to_s + LATE_S))

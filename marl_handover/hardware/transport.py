@@ -17,10 +17,12 @@ from serial.tools import list_ports
 
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.errors import FlushFailed, PortLost, PortNotFound
-from marl_handover.hardware.protocol import CANCEL
 from marl_handover.hardware.settings import TimeoutConfig
 
 BITS_PER_BYTE = 10
+CANCEL = b"\x1b"
+"""Escape: a board drops what it was sent of the present line, so that a fresh start is not glued to an old fragment."""
+
 WAIT_SLICE_S = 0.004
 """Nobody who waits for an answer is out of reach for longer."""
 

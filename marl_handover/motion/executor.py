@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from marl_handover.cell import CellModel, build_cell, cell_config
 from marl_handover.config import CellConfig, MotionConfig, require_choice
 from marl_handover.errors import HandoverError, InvalidSetting
-from marl_handover.motion.grasp_ik import grasp_joints
+from marl_handover.motion.planner import grasp_joints
 from marl_handover.motion.trajectory import NoPath, OutOfArmsReach, PickPlacePaths
 
 if TYPE_CHECKING:

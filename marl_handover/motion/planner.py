@@ -16,16 +16,18 @@ from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed
 from marl_handover.motion.collision_model import Scene, arm_collision_model, ball_around, standing_arm, standing_block
-from marl_handover.motion.grasp_ik import grasp_joints
 from marl_handover.motion.initial_guesses import GRIP_LEAST_MM, SAMPLES, carrying_guesses, reaching_guesses
 from marl_handover.motion.path_optimizer import FoundPath, Segment, find_path
-from marl_handover.motion.trajectory import PickPlacePaths, TransferMotion
+from marl_handover.motion.trajectory import OutOfArmsReach, PickPlacePaths, TransferMotion
 from marl_handover.progress import working
 
 Floats = NDArray[np.float64]
 
 PAPER_TOLERANCE_MM = 1.0
 """The paper's formulation holds its demands at its samples; in between it may fall short by this much."""
+
+EDGE_RAD = 1e-4
+"""A pose at the very edge may need a joint this far past its limit; the joint stays at the limit, the grip is some 20 um off."""
 
 STILL_MM = 1e-3
 """A transfer shorter than this is none."""
@@ -234,3 +236,19 @@ def detour_length(ends_mm: Floats, radius_mm: float) -> float:
 
 def _turns_left(s: Floats, z: Floats, a: int, b: int, c: int) -> bool:
     return bool((s[b] - s[a]) * (z[c] - z[a]) - (z[b] - z[a]) * (s[c] - s[a]) >= 0.0)
+
+
+def grasp_joints(model: CellModel, arm: int, what: str, position_mm: Floats) -> Floats:
+    """Joints (5,) with the grip at the pick height over a world position (2,), pitch = roll = 0; ``what`` the arm is to do there.
+
+    Raises:
+        OutOfArmsReach: no joint vector within the limits does it.
+    """
+    base, arm_model = model.cell.bases[arm], model.arm
+    x, y = base.to_local(position_mm)
+    q = arm_model.ik(np.array([x, y, model.cell.config.pick_height_mm]))
+    inside = np.clip(q, arm_model.lower_rad, arm_model.upper_rad)
+    good = (np.abs(q - inside) <= EDGE_RAD).all(axis=-1)  # NaN, out of reach, is not
+    if not good.any():
+        raise OutOfArmsReach(arm, what, position_mm)
+    return np.asarray(inside[int(np.argmax(good))])

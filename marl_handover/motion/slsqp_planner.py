@@ -23,9 +23,9 @@ from marl_handover.compiled import compiled
 from marl_handover.geometry.closed_form import grip_in_plane, grip_speed
 from marl_handover.geometry.kernels import elbow_up
 from marl_handover.motion.collision_model import Scene
+from marl_handover.motion.objective import dense_margins
 from marl_handover.motion.path_optimizer import DENSE_SAMPLES, FoundPath, NoPath, Segment, require_free_ends
 from marl_handover.motion.trajectory import sampled_basis
-from marl_handover.motion.validation import dense_margins
 
 Floats = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ def first_guess(segment: Segment) -> Floats:
 
 @compiled(error_model="python")
 def sample_margins(Q: Floats, scene: Scene, out: Floats) -> None:
-    """Fill ``out`` (S, 6) with the fields of :class:`~marl_handover.motion.validation.Margins` of each joint sample of ``Q`` (S, 4)."""
+    """Fill ``out`` (S, 6) with the fields of :class:`~marl_handover.motion.objective.Margins` of each joint sample of ``Q`` (S, 4)."""
     for i in range(Q.shape[0]):
         dense_margins(Q[i : i + 1], scene, out[i])
 

@@ -16,8 +16,7 @@ from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.control.interactive.world_state import lying
 from marl_handover.errors import HandoverError
-from marl_handover.motion.grasp_ik import grasp_joints
-from marl_handover.motion.planner import MotionPlanner
+from marl_handover.motion.planner import MotionPlanner, grasp_joints
 from marl_handover.motion.trajectory import LOADED_PHASES
 from marl_handover.task.rules import Rules
 from marl_handover.viewer.scene import CellScene

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marl_handover.hardware import protocol
+from marl_handover.hardware import ssc32 as protocol
 from marl_handover.hardware.emulator.board import FRAME_S, EmulatedBoard
 
 

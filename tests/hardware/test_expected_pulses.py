@@ -17,8 +17,9 @@ from marl_handover.hardware.emulator.device import EmulatedDevice, make_fault
 from marl_handover.hardware.emulator.protocol_ssc32emu import mount
 from marl_handover.hardware.errors import BadReply, DeviceError, PulseMismatch, Stopped
 from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.expected_pulses import FRAME_S, ExpectedPulses
 from marl_handover.hardware.settings import BoardConfig, TimeoutConfig
-from marl_handover.hardware.ssc32 import FRAME_S, ExpectedPulses, Ssc32
+from marl_handover.hardware.ssc32 import Ssc32
 from marl_handover.motion.trajectory import Phase
 
 

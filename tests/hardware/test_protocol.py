@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marl_handover.hardware import protocol
+from marl_handover.hardware import ssc32 as protocol
 from marl_handover.hardware.errors import BadCommand, BadReply, DuplicateChannel, LineTooLong, MixedCommands
-from marl_handover.hardware.protocol import Level, Move
+from marl_handover.hardware.ssc32 import Level, Move
 
 channels = st.integers(0, 31)
 pulses = st.integers(500, 2500)

@@ -10,8 +10,7 @@ from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import CentralisedConfig, MotionConfig
 from marl_handover.geometry.capsules import segment_distance
 from marl_handover.motion.batched_paths import CROWDING, JOINTS, ROUNDING_MM, MotionCheck, MotionNumbers, ends_of
-from marl_handover.motion.grasp_ik import grasp_joints
-from marl_handover.motion.planner import MotionPlanner
+from marl_handover.motion.planner import MotionPlanner, grasp_joints
 from marl_handover.motion.trajectory import basis, sample_places
 from tests.symmetries import flips_x, mirror
 

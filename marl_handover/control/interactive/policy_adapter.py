@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
 from marl_handover.config import LoopConfig, MotionConfig
-from marl_handover.control.transfers import Placement, TransferCommand, finish_command, rollout, transfer_command
+from marl_handover.control.closed_loop import finish_command, transfer_command
+from marl_handover.control.transfers import Placement, TransferCommand, rollout
 from marl_handover.errors import InvalidSetting
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.policies import SupervisorPolicy

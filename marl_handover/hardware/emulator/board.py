@@ -11,7 +11,9 @@ import random
 import re
 from dataclasses import dataclass
 
-from marl_handover.hardware.protocol import CHANNELS, CR, ESC, PULSE_US, READING_US, parse_version
+from marl_handover.hardware.settings import CHANNELS, PULSE_US, READING_US
+from marl_handover.hardware.ssc32 import CR, parse_version
+from marl_handover.hardware.transport import CANCEL
 
 FRAME_S = 0.02
 
@@ -105,9 +107,9 @@ class EmulatedBoard:
         for part in re.split(rb"(?<=\r)", data):
             ended = part.endswith(CR)
             kept = part[:-1] if ended else part
-            if ESC in kept:
+            if CANCEL in kept:
                 self._buffer.clear()
-                kept = kept[kept.rindex(ESC) + 1 :]
+                kept = kept[kept.rindex(CANCEL) + 1 :]
             self._buffer += kept[: max(0, _MAX_BUFFER - len(self._buffer))]
             if ended:
                 text = bytes(self._buffer).decode("latin-1")
