@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import errno
 import re
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +23,9 @@ def requirements() -> dict[str, tuple[str, ...]]:
     They are those of the checkout's pyproject.toml or of the installed package's metadata. An editable install's metadata is as old as the
     install, so the checkout goes first.
     """
+    import tomllib  # here: a stop needs errors, and must wait for nothing else
+    from importlib.metadata import PackageNotFoundError, requires
+
     file = Path(__file__).resolve().parents[1] / "pyproject.toml"
     if file.is_file():
         project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
@@ -264,8 +265,6 @@ class MissingExtra(HandoverError):
     """A setting needs a package that is not installed."""
 
     def __init__(self, setting: str, package: str, extra: str) -> None:
-        from marl_handover.errors import install_line  # here: a stop needs errors, and must not wait for package metadata
-
         super().__init__(f"{setting} needs the package {package}; run: {install_line(extra)}")
         self.setting, self.package, self.extra = setting, package, extra
 

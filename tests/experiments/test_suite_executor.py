@@ -85,7 +85,7 @@ def test_an_exception_fails_its_item_only(tmp_path, jobs):
     results = play(tmp_path, ["", "raise", "leave", "unpicklable", ""], jobs=jobs)
     assert {item for item, result in results.items() if isinstance(result, Failure)} == {1, 2, 3}
     failure = results[1]
-    assert failure.error.startswith("ValueError: item 1 is not welcome (test_executor.py, line ")
+    assert failure.error.startswith("ValueError: item 1 is not welcome (test_suite_executor.py, line ")
     assert failure.error.endswith(", in noted)")
     assert "Traceback" in failure.traceback
     assert failure.item == (tmp_path, 1, "raise")
@@ -140,7 +140,7 @@ def test_no_worker_outlives_the_process_that_started_it(tmp_path, how):
     import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
     from pathlib import Path
     from marl_handover.experiments.executor import fan_out
-    from test_executor import noted
+    from test_suite_executor import noted
     for _ in fan_out(noted, [(Path({str(tmp_path)!r}), item, "slow") for item in range(200)], jobs=2, progress=False):
         pass
     """
