@@ -180,7 +180,7 @@ class Generator:
         if get_origin(hint) in (Union, types.UnionType):
             hint = next(each for each in get_args(hint) if each is not type(None))
         if bounds.choices:
-            return str(draw.choice(bounds.choices))
+            return str(draw.choice(list(bounds.choices)))
         if hint is bool:
             return draw.choice(("true", "false"))
         if get_origin(hint) is list:
@@ -273,10 +273,9 @@ def prepared(folder: Path) -> Iterator[None]:
             importlib.import_module(place.rsplit(".", 2)[0] if place.rsplit(".", 2)[1][:1].isupper() else place.rsplit(".", 1)[0])
             stack.enter_context(mock.patch(place, passed))
         stack.enter_context(mock.patch.object(assessment, "evaluate", small))
-        for name in ("roll", "settings", "latch"):
+        for name in ("session_registry", "settings", "estop"):
             module = importlib.import_module(f"marl_handover.hardware.{name}")
-            if hasattr(module, "user_path"):
-                stack.enter_context(mock.patch.object(module, "user_path", lambda suffix: folder / f"user{suffix}"))
+            stack.enter_context(mock.patch.object(module, "user_path", lambda suffix: folder / f"user{suffix}"))
         stack.enter_context(mock.patch.dict(os.environ, {"HOME": str(folder), "XDG_CACHE_HOME": str(folder / "cache")}))
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("ignore")
