@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from marl_handover.cell import CellModel, build_cell, cell_config
 from marl_handover.config import CellConfig, MotionConfig, require_choice
 from marl_handover.errors import HandoverError, InvalidSetting
-from marl_handover.motion.planner import grasp_joints
 from marl_handover.motion.trajectory import NoPath, OutOfArmsReach, PickPlacePaths
 
 if TYPE_CHECKING:
@@ -75,6 +74,8 @@ class ExecutorAgent:
         return {"paths": points, "grasp": willing, "release": willing, "reason": np.int64(reason)}
 
     def _direct(self, pick_mm: Floats, place_mm: Floats, joints_rad: Floats) -> PickPlacePaths:
+        from marl_handover.motion.planner import grasp_joints  # here, as below: environments that plan no motion compile nothing
+
         ends = (
             joints_rad,
             grasp_joints(self.model, self.arm, "pick up", pick_mm),
