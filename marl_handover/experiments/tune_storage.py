@@ -47,19 +47,28 @@ class StorageUnavailable(HandoverError):
         super().__init__(f"storage={hidden(storage)}: {' '.join(hidden(reason).split())}")
 
 
+_BEGIN = b'{"op_code":'
+"""How every record of Optuna's journals begins, and so every journal."""
+
+
 class Journal(JournalFileBackend):
     """Optuna's journal file, in which a line that was cut off, by a full disk or a killed process, is no end of the study.
 
     It is taken away before the next one is appended, which Optuna would put behind it on the same line. A warning says so.
 
     Raises:
-        CorruptFile: there is something else than a regular file.
+        CorruptFile: there is something else than a regular file, or than a journal.
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self._own = path, JournalFileSymlinkLock(str(path))
         if path.exists() and not path.is_file():
             raise CorruptFile("journal", path, "it is no regular file")
+        if path.exists():
+            with path.open("rb") as stream:
+                first = stream.read(len(_BEGIN))
+            if not _BEGIN.startswith(first):  # nothing of it is touched
+                raise CorruptFile("journal", path, "no study wrote it")
         super().__init__(str(path), self._own)
         if not self._whole():
             with self._locked():
@@ -125,13 +134,17 @@ def open_storage(storage: str) -> BaseStorage:
 
     Raises:
         StorageUnavailable: for one line about whatever is wrong with it.
-        CorruptFile, CannotWrite: a journal is no regular file, or there is no room for it.
+        CorruptFile, CannotWrite: a file is no journal, or there is no room for it.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         if "://" not in storage:
             make_folder(Path(storage).parent)
-            return JournalStorage(Journal(Path(storage)))
+            journal = Journal(Path(storage))
+            try:
+                return JournalStorage(journal)
+            except (KeyError, TypeError, AttributeError, IndexError) as error:
+                raise CorruptFile("journal", Path(storage), "not every line is a record of a study") from error
         wait: dict[str, Any] = {"connect_args": {"timeout": SQLITE_WAIT_S}} if storage.startswith("sqlite") else {"pool_pre_ping": True}
         return RDBStorage(storage, engine_kwargs=wait)
     except HandoverError:

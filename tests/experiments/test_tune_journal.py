@@ -12,8 +12,8 @@ import sys
 
 import pytest
 
-from marl_handover.errors import CannotWrite, CorruptFile
-from marl_handover.experiments.tune_storage import Journal, open_study
+from marl_handover.errors import CannotWrite, CorruptFile, HandoverError
+from marl_handover.experiments.tune_storage import Journal, open_storage, open_study
 
 
 def tell(study, values):
@@ -91,3 +91,14 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "study.journal")
     with pytest.raises(CorruptFile, match="no regular file"):
         open_study(str(tmp_path / "study.journal"), "s")
+
+
+@pytest.mark.parametrize(
+    "content", ['{"episode": 0}\n', "years of work", '{"op_code":9}\n', '{"op_code":0}\n', '{"op_code":4,"worker_id":"a"}\n']
+)
+def test_a_file_that_is_no_journal_is_named_and_left_as_it_is(tmp_path, content):
+    path = tmp_path / "trace.jsonl"
+    path.write_text(content)
+    with pytest.raises(HandoverError, match=r"trace\.jsonl"):
+        open_storage(str(path))
+    assert path.read_text() == content
