@@ -33,10 +33,10 @@ from marl_handover.control.settings import TwinConfig
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels, calibrate_lens, hung_camera
 from marl_handover.perception.detector import Detector
+from marl_handover.perception.markers import charuco_sheet
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.perception.settings import BoardConfig, LookConfig, MountConfig
-from marl_handover.perception.sheets import charuco_sheet
 
 DEFAULTS = {"frames": 1200, "cameras": 12, "boards": 20, "seed": 0, "results": "bench/results"}
 SIZE_PX = (1280, 720)

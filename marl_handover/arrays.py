@@ -11,6 +11,10 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+"""A numpy array of float64."""
 
 Array = Any
 """A numpy array or a torch tensor."""

@@ -32,9 +32,8 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from marl_handover.bounds import check_bounds, expand_paths
 from marl_handover.errors import BadOverride, CorruptFile, HandoverError, MissingFile, RenamedKey, UnknownChoice, UnknownKey
-from marl_handover.files import expanded
+from marl_handover.files import expanded, resource_path
 from marl_handover.parsing import DEPTH, nesting, parse_yaml, read_yaml
-from marl_handover.resources import resource_path
 
 Groups = Mapping[str, Mapping[str, type]]
 """Dotted key -> option name -> dataclass."""

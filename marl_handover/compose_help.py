@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, get_type_hints
 
 from marl_handover.compose import Groups, option_names, without_none
 from marl_handover.errors import MissingFile
-from marl_handover.resources import resource_path
+from marl_handover.files import resource_path
 
 
 class KeyRow(NamedTuple):

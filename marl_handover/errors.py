@@ -280,3 +280,8 @@ class MissingProgram(WorkFailed):
 def first_line(error: BaseException) -> str:
     """First line of what an error says, or its kind if it says nothing."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def counted(count: int, what: str) -> str:
+    """``1 transfer``, ``2 transfers``."""
+    return f"{count:,} {what}{'' if count == 1 else 's'}"

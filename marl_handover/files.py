@@ -1,4 +1,4 @@
-"""Reading files of bounded size, and writing them so that nothing is ever half written."""
+"""Reading files of bounded size, writing them so that nothing is ever half written, and where those lie that travel with the package."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ from marl_handover.errors import CannotWrite, CorruptFile, InvalidSetting, Missi
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+
 LOG = logging.getLogger(__name__)
+_PACKAGE = Path(__file__).resolve().parent
 Parsed = TypeVar("Parsed")
 
 MEGABYTE = 1_000_000
@@ -400,3 +402,24 @@ def keep(path: Path) -> Path | None:
     kept = next(name for name in names if not name.exists())
     copy_whole(path, kept)
     return kept
+
+
+def resource_path(relative: str) -> Path:
+    """Path of a shipped file or folder, such as ``"configs"`` or ``"urdf/al5a.urdf"``.
+
+    In a wheel the files lie in ``marl_handover/resources/``; in a checkout or an editable install, beside the package.
+    Raises :class:`MissingFile` if it is in neither place.
+    """
+    for root in (_PACKAGE / "resources", _PACKAGE.parent):
+        path = root / relative
+        if path.exists():
+            return path
+    raise MissingFile("resource", relative, "reinstall the package")
+
+
+def package_path(relative: str) -> Path:
+    """Path of a file inside the package folder itself, such as ``"pretrained/b.npz"``. Raises :class:`MissingFile`."""
+    path = _PACKAGE / relative
+    if not path.exists():
+        raise MissingFile("resource", relative, "reinstall the package")
+    return path

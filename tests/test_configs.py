@@ -8,7 +8,7 @@ import yaml
 from marl_handover.cell import load_cell
 from marl_handover.commands import evaluate, train
 from marl_handover.compose import compose, from_text, to_yaml
-from marl_handover.resources import resource_path
+from marl_handover.files import resource_path
 
 CONFIGS = resource_path("configs")
 FILES = {folder.name: sorted(path.stem for path in folder.glob("*.yaml")) for folder in CONFIGS.iterdir() if folder.is_dir()}

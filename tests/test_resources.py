@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from marl_handover.errors import MissingFile
-from marl_handover.resources import resource_path
+from marl_handover.files import resource_path
 
 ROOT = Path(__file__).resolve().parent.parent
 PRETRAINED = sorted((ROOT / "marl_handover" / "pretrained").glob("*.npz"))
@@ -52,7 +52,7 @@ def test_the_wheel_holds_every_resource(wheel):
 def test_an_installed_wheel_finds_them(wheel, tmp_path):
     site = wheel[1]
     code = (
-        "import marl_handover.resources as r\n"
+        "import marl_handover.files as r\n"
         "for name in ('configs', 'urdf'): print(r.resource_path(name))\n"
         "from marl_handover.cli import main; raise SystemExit(main(['doctor', '--help']))"
     )

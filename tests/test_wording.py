@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from marl_handover.errors import counted
 from marl_handover.viewer.words import degrees_words, place_words
-from marl_handover.wording import counted
 
 SOURCES = sorted((Path(__file__).resolve().parents[1] / "marl_handover").rglob("*.py"))
 NOT_SO = {

@@ -10,14 +10,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.arrays import Array, namespace, wrap
+from marl_handover.arrays import Array, Floats, namespace, wrap
 from marl_handover.cell.chart import Chart
 from marl_handover.cell.symmetry import LEFT, RIGHT
 from marl_handover.errors import InvalidSetting
 from marl_handover.task.observations import ARM_FIELDS, RAW_FIELDS
 from marl_handover.task.rules import Rules
-
-Floats = NDArray[np.float64]
 
 RESOLUTION_RAD = 1e-5
 """Turns that differ by less are the same to :func:`grid_transfers`."""

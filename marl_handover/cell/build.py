@@ -13,12 +13,11 @@ from marl_handover.cell.reach import AnnulusFit, ManipulationGrid, fit_annulus, 
 from marl_handover.compose import from_yaml, to_yaml
 from marl_handover.config import CellConfig, require_choice
 from marl_handover.errors import InvalidSetting, MissingFile, UnequalArms
-from marl_handover.files import expanded
+from marl_handover.files import expanded, resource_path
 from marl_handover.geometry.capsules import base_radius_mm
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.se2 import SE2
 from marl_handover.geometry.urdf import read_urdf
-from marl_handover.resources import resource_path
 
 
 class CellModel(NamedTuple):

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from marl_handover.cell import build_cell
-from marl_handover.commands.person import Person, confirmed
 from marl_handover.config import CellConfig, MotionConfig, bounded, check_bounds, chosen, seed_field
 from marl_handover.control.settings import WorkcellConfig
 from marl_handover.geometry.urdf import ARM_JOINTS
@@ -56,6 +55,7 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: CalibrateCommand) -> int:
     """Go through the procedures and save what they give."""
+    from marl_handover.control.calibration import TerminalOperator, confirmed
     from marl_handover.control.workcell import open_devices
 
     check_bounds(config)
@@ -68,7 +68,7 @@ def run(config: CalibrateCommand) -> int:
     if config.what in ("all", "camera", "servos"):
         devices = open_devices(config, model, config.motion, confirmed)
         try:
-            operator: Operator = devices.twin or Person(config.hand_markers)
+            operator: Operator = devices.twin or TerminalOperator(config.hand_markers)
             if config.what in ("all", "camera"):
                 _camera(config, devices, operator)
             if config.what in ("all", "servos"):
@@ -81,7 +81,7 @@ def run(config: CalibrateCommand) -> int:
 
 
 def _sheets(config: CalibrateCommand, model: CellModel) -> int:
-    from marl_handover.perception.sheets import PX_PER_MM, marker_sheet, page, save_sheet, write_sheets
+    from marl_handover.perception.markers import PX_PER_MM, marker_sheet, page, save_sheet, write_sheets
 
     folder, cards, target = config.folder() / "sheets", config.hand_markers, config.target
     files = write_sheets(folder, model.cell.config.block, target, config.board, config.paper)
@@ -141,7 +141,7 @@ def _servos(config: CalibrateCommand, devices: Devices, operator: Operator, mode
 
 
 def _grippers(config: CalibrateCommand, model: CellModel) -> None:
-    from marl_handover.control.calibration import Grip, GripperCalibration, places
+    from marl_handover.control.calibration import Grip, GripperCalibration, TerminalOperator, confirmed, places
     from marl_handover.control.hardware_backend import HardwareBackend
     from marl_handover.hardware.calibration import save_grippers
     from marl_handover.motion.planner import MotionPlanner
@@ -151,7 +151,7 @@ def _grippers(config: CalibrateCommand, model: CellModel) -> None:
     backend = HardwareBackend(model, config.motion, config=config, confirm=confirmed, grippers=False)
     found: dict[str, Grip] = {}
     try:
-        operator: Operator = backend.workcell.twin or Person(config.hand_markers)
+        operator: Operator = backend.workcell.twin or TerminalOperator(config.hand_markers)
         first = places(model.cell)[0]
         operator.stand_block(first)
         backend.reset(np.array(first), config.seed)

@@ -14,8 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from marl_handover.errors import CORE, PACKAGE, install_line, name_of, requirements
-from marl_handover.wording import counted
+from marl_handover.errors import CORE, PACKAGE, counted, install_line, name_of, requirements
 
 
 @dataclass

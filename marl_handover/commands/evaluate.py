@@ -11,11 +11,10 @@ import numpy as np
 
 from marl_handover.config import path_field
 from marl_handover.control.evaluation import AssessmentConfig, assess
-from marl_handover.errors import InvalidSetting, MissingFile
+from marl_handover.errors import InvalidSetting, MissingFile, counted
 from marl_handover.files import write_whole
 from marl_handover.learning.evaluation import Evaluation
 from marl_handover.task.rules import Outcome
-from marl_handover.wording import counted
 
 
 @dataclass

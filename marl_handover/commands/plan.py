@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from marl_handover.arrays import wrap
+from marl_handover.arrays import Floats, wrap
 from marl_handover.cell import NO_ARM
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import (
@@ -28,17 +27,14 @@ from marl_handover.config import (
     path_field,
     seed_field,
 )
-from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, WorkFailed
+from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, WorkFailed, counted
 from marl_handover.policies import SupervisorPolicy, adapted
 from marl_handover.task.episode import advance
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Outcome, Rules, Transition
-from marl_handover.wording import counted
 
 if TYPE_CHECKING:
     from marl_handover.motion.planner import MotionPlanner
-
-Floats = NDArray[np.float64]
 
 OUT_OF_REACH, MOTION = "out_of_reach", "motion"
 REASONS = {OUT_OF_REACH: "out of this arm's reach", MOTION: "the policy's motion breaks a limit or collides"}

@@ -83,8 +83,8 @@ def _paths(text: str) -> list[Path]:
 
 
 def _run(config: PlotConfig) -> tuple[Figure, Path]:
+    from marl_handover.learning.recorder import read_metrics
     from marl_handover.report.learning import learning_figure
-    from marl_handover.report.metrics import read_metrics
 
     folders = run_folders(config.run)
     figure = learning_figure({str(folder): read_metrics(folder) for folder in folders})
@@ -156,7 +156,7 @@ def _transfers(config: PlotConfig, result: dict[str, Any]) -> tuple[Any, Any]:
 
 
 def _errors(config: PlotConfig) -> tuple[Figure, Path]:
-    from marl_handover.report.errors import errors_figure
+    from marl_handover.report.evaluation import errors_figure
     from marl_handover.report.traces import symmetry_of
 
     path, trace = _traces(config, 1)[0]
@@ -165,7 +165,7 @@ def _errors(config: PlotConfig) -> tuple[Figure, Path]:
 
 
 def _confusion(config: PlotConfig) -> tuple[Figure, Path]:
-    from marl_handover.report.errors import endings_against, meant_figure
+    from marl_handover.report.evaluation import endings_against, meant_figure
 
     (path, trace), *more = _traces(config, 2)
     default = path.with_name(f"{path.stem}_confusion.png")

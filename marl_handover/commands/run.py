@@ -9,22 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marl_handover import policies
-from marl_handover.commands.person import confirmed, laid_anew
+from marl_handover.arrays import Floats
 from marl_handover.config import POSE, CellConfig, LoopConfig, MotionConfig, TaskChanges, bounded, check_bounds, path_field, seed_field
 from marl_handover.control.settings import WorkcellConfig
-from marl_handover.errors import InvalidSetting, MissingFile, OutOfReach
-from marl_handover.wording import counted
+from marl_handover.errors import InvalidSetting, MissingFile, OutOfReach, counted
 
 if TYPE_CHECKING:
     from marl_handover.control.closed_loop import ClosedLoop
     from marl_handover.control.session import Session
     from marl_handover.control.transfers import Episode
     from marl_handover.task.rules import Rules
-
-Floats = NDArray[np.float64]
 
 
 @dataclass
@@ -57,6 +53,7 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: RunCommand) -> int:
     """Play and print. 0 if every episode ended at its goal, else 1."""
+    from marl_handover.control.calibration import confirmed, laid_anew
     from marl_handover.control.closed_loop import make_loop
     from marl_handover.control.session import Session
     from marl_handover.control.telemetry import Publisher

@@ -10,18 +10,16 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from marl_handover import policies
-from marl_handover.arrays import wrap
+from marl_handover.arrays import Floats, wrap
 from marl_handover.cell import Cell, build_cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import POSE, CellConfig, MotionConfig, TaskChanges, bounded, check_bounds, chosen, path_field, seed_field
-from marl_handover.errors import InvalidSetting, OutOfReach, WorkFailed
+from marl_handover.errors import InvalidSetting, OutOfReach, WorkFailed, counted
 from marl_handover.policies.policy import NobodyMoves
 from marl_handover.progress import Bar
 from marl_handover.task.rules import Outcome
-from marl_handover.wording import counted
 
 if TYPE_CHECKING:
     from marl_handover.envs.handover_aec import HandoverEnv
@@ -29,8 +27,6 @@ if TYPE_CHECKING:
     from marl_handover.simulation.backend import BulletBackend
     from marl_handover.simulation.film import Film
     from marl_handover.task.rules import Rules
-
-Floats = NDArray[np.float64]
 
 
 @dataclass

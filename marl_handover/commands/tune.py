@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from marl_handover.commands import train
 from marl_handover.config import bounded, check_bounds, chosen, name_field, path_field
-from marl_handover.errors import InvalidSetting
-from marl_handover.files import read_bounded, write_whole
+from marl_handover.errors import InvalidSetting, counted
+from marl_handover.files import read_bounded, resource_path, write_whole
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.progress import say
-from marl_handover.resources import resource_path
-from marl_handover.wording import counted
 
 if TYPE_CHECKING:
     from optuna.study import Study
@@ -75,8 +73,7 @@ def _search(config: TuneConfig) -> tuple[Search, Path]:
     """What to do, checked, and the folder for it."""
     from marl_handover.cell import build_cell
     from marl_handover.compose import option_file
-    from marl_handover.experiments.tune import Search
-    from marl_handover.experiments.tune_space import load_space
+    from marl_handover.experiments.tune import Search, load_space
     from marl_handover.experiments.tune_storage import located
     from marl_handover.learning.trainer import usable_device
 

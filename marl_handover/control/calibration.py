@@ -10,23 +10,26 @@ it carries the block; it is never closed further than it needs.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell import Cell
 from marl_handover.control.hardware_backend import BlockNotSeen, HardwareBackend
+from marl_handover.control.settings import CardConfig
+from marl_handover.errors import WorkFailed
 from marl_handover.hardware.calibration import CalibrationProblem, shifted
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.settings import ARMS, GripperConfig
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.perception.calibration import CameraCalibration, Pixels, calibrate_lens
 from marl_handover.perception.camera import Camera
+from marl_handover.perception.markers import Sheet, charuco_sheet
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
 from marl_handover.perception.settings import BoardConfig
-from marl_handover.perception.sheets import Sheet, charuco_sheet
 
 PLACES = ((0.0, 0.0, 0.0), (-90.0, 20.0, math.pi / 2), (90.0, -20.0, -math.pi / 2))
 """Where the board is laid, x_mm, y_mm, yaw_rad of its middle: between them they cover the shared part of the table."""
@@ -34,6 +37,16 @@ PLACES = ((0.0, 0.0, 0.0), (-90.0, 20.0, math.pi / 2), (90.0, -20.0, -math.pi / 
 VIEWS = 20
 _MARGIN_MM = 10.0
 _NEW_PICTURE_S = 0.1
+
+RANGE_MM = 1.6
+"""How far the settings may be off, either way, for each finger."""
+
+STEP_MM = 0.2
+SURE_MM = 0.5
+"""So much further than where the block was first carried: that grip may have been a lucky one."""
+
+_ALPHA = 0.7
+"""Far apart: over a short way a hand lifts little, and fingers that are not closed drag the block along by its pin."""
 
 
 class Operator(Protocol):
@@ -56,6 +69,69 @@ class Operator(Protocol):
 
     def stand_block(self, place: Sequence[float]) -> None:
         """Stand the block at ``place`` (3,): x_mm, y_mm, theta_rad."""
+
+
+class NobodyThere(WorkFailed):
+    """A question for a person, and no terminal to ask it on."""
+
+
+def confirmed(question: str) -> bool:
+    """Ask, and take nothing but a whole yes for one. Without a terminal: False, nobody is there."""
+    if not sys.stdin.isatty():
+        return False
+    return input(f"{question} Type yes: ").strip().lower() == "yes"
+
+
+def laid_anew() -> None:
+    """Wait until somebody has laid block and goal for the next episode. Without a terminal: they stay as they are."""
+    if sys.stdin.isatty():
+        input("lay the block, and the goal's marker, where the next episode is to find them, hands off the table; then press Enter ")
+
+
+class TerminalOperator:
+    """A person at a terminal, who is told what to do and presses Enter when it is done."""
+
+    def __init__(self, cards: CardConfig) -> None:
+        self._cards = cards
+
+    def hold_board(self, sheet: Sheet, number: int, count: int) -> None:
+        """See the protocol."""
+        _wait(
+            f"{number + 1} of {count}: hold the board before the camera, slanted by 20 to 40 degrees, every time elsewhere in the picture"
+        )
+
+    def lay_board(self, sheet: Sheet, place: Sequence[float]) -> None:
+        """See the protocol."""
+        _wait(
+            f"lay the board flat, its middle at x = {place[0]:g} mm, y = {place[1]:g} mm, its rows turned by {math.degrees(place[2]):z.0f} "
+            "degrees from +x"
+        )
+
+    def take_board_away(self) -> None:
+        """See the protocol."""
+        _wait("take the board away")
+
+    def glue_cards(self) -> None:
+        """See the protocol."""
+        x, y, z = self._cards.place_mm
+        _wait(
+            f"fix marker {self._cards.ids[0]} flat on the left hand, {self._cards.ids[1]} on the right one: middle {-x:g} mm "
+            f"behind the grip, {y:g} mm to its left, {z:g} mm above it, its upper edge to the left"
+        )
+
+    def take_cards_off(self) -> None:
+        """See the protocol."""
+        _wait("take the markers off the hands")
+
+    def stand_block(self, place: Sequence[float]) -> None:
+        """See the protocol."""
+        _wait(f"stand the block, its marker up, at about x = {place[0]:g} mm, y = {place[1]:g} mm, hands off the table")
+
+
+def _wait(text: str) -> None:
+    if not sys.stdin.isatty():
+        raise NobodyThere(f"this needs a person at a terminal: {text}")
+    input(f"{text}; then press Enter ")
 
 
 def calibrate_camera(
@@ -84,19 +160,6 @@ def calibrate_camera(
         laid.append(BoardOnTable(picture(), *place))
     operator.take_board_away()
     return locate_by_board(lens, laid, board, name)
-
-
-Floats = NDArray[np.float64]
-
-RANGE_MM = 1.6
-"""How far the settings may be off, either way, for each finger."""
-
-STEP_MM = 0.2
-SURE_MM = 0.5
-"""So much further than where the block was first carried: that grip may have been a lucky one."""
-
-_ALPHA = 0.7
-"""Far apart: over a short way a hand lifts little, and fingers that are not closed drag the block along by its pin."""
 
 
 def places(cell: Cell) -> tuple[tuple[float, float, float], ...]:

@@ -12,8 +12,8 @@ from types import TracebackType
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell import NO_ARM, build_cell
 from marl_handover.config import LoopConfig, MotionConfig
 from marl_handover.control.transfers import (
@@ -35,8 +35,6 @@ from marl_handover.motion.trajectory import OutOfArmsReach, TransferMotion
 from marl_handover.policies import SupervisorPolicy
 from marl_handover.task.episode import conclude, final_transfer, measured_verdict, nobody_moves
 from marl_handover.task.rules import Outcome, Rules, Verdict
-
-Floats = NDArray[np.float64]
 
 
 @runtime_checkable

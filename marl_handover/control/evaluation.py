@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from marl_handover import policies
-from marl_handover.arrays import one_where, wrap
+from marl_handover.arrays import Floats, one_where, wrap
 from marl_handover.config import (
     BACKENDS,
     CellConfig,
@@ -42,8 +42,6 @@ from marl_handover.task.rules import Outcome, Rules
 if TYPE_CHECKING:
     from marl_handover.control.closed_loop import ClosedLoop
     from marl_handover.control.transfers import Episode, Transfer
-
-Floats = NDArray[np.float64]
 
 
 @dataclass

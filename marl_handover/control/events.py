@@ -18,9 +18,8 @@ from typing import Any, Self
 import numpy as np
 
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.errors import CannotWrite
+from marl_handover.errors import CannotWrite, counted
 from marl_handover.files import GrowingFile
-from marl_handover.wording import counted
 
 
 class Event(StrEnum):

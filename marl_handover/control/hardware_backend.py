@@ -12,9 +12,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from marl_handover.arrays import wrap
+from marl_handover.arrays import Floats, wrap
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.control.events import Event
@@ -30,8 +29,6 @@ from marl_handover.motion.pick_place import timed_phases
 from marl_handover.motion.trajectory import LOADED_PHASES, Phase, PickPlacePaths
 from marl_handover.perception.calibration import Pixels
 from marl_handover.task.rules import carried
-
-Floats = NDArray[np.float64]
 
 FRESH_S = 0.5
 """A look that is no older than this need not be taken again."""

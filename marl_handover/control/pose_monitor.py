@@ -7,16 +7,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from marl_handover.arrays import wrap
+from marl_handover.arrays import Floats, wrap
 from marl_handover.control.events import Event, EventLog
 from marl_handover.control.settings import WatchConfig
 from marl_handover.hardware.clock import Clock
 from marl_handover.perception.camera import Camera, Frame, StaleFrame
 from marl_handover.perception.tracker import Seen, Tracker
-
-Floats = NDArray[np.float64]
 
 
 class View(NamedTuple):

@@ -18,13 +18,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.errors import CorruptFile, MissingFile
 from marl_handover.files import read_bounded
 from marl_handover.parsing import parse_json
-
-Floats = NDArray[np.float64]
 
 _REQUEST = re.compile(r"control-\d+-\d+\.json")
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from marl_handover.arrays import wrap
+from marl_handover.arrays import Floats, wrap
 from marl_handover.cell.build import CellModel
 from marl_handover.control.settings import CardConfig
 from marl_handover.geometry.se3 import transform
@@ -31,8 +31,6 @@ from marl_handover.perception.calibration import CameraCalibration, Pixels
 from marl_handover.perception.camera import Camera
 from marl_handover.perception.markers import MarkerFinder
 from marl_handover.perception.settings import TargetConfig
-
-Floats = NDArray[np.float64]
 
 LEAST_SIGHTINGS = 8
 WORST_MM = 5.0

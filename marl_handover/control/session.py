@@ -7,8 +7,9 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.control.closed_loop import ClosedLoop
 from marl_handover.control.events import Event, EventLog
@@ -18,7 +19,6 @@ from marl_handover.control.transfers import Episode, Transfer, transfer_row
 from marl_handover.errors import WorkFailed
 from marl_handover.hardware.errors import Stopped
 
-Floats = NDArray[np.float64]
 Goals = Callable[[], Floats]
 
 

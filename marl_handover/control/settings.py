@@ -10,6 +10,7 @@ from typing import Any
 from marl_handover.compose import from_yaml
 from marl_handover.config import bounded, check_bounds, path_field, require_between, seed_field
 from marl_handover.errors import InvalidSetting
+from marl_handover.files import resource_path
 from marl_handover.hardware.settings import ARMS, TWIN, HardwareConfig
 from marl_handover.perception.settings import (
     MARKERS,
@@ -21,7 +22,6 @@ from marl_handover.perception.settings import (
     TargetConfig,
     TrackerConfig,
 )
-from marl_handover.resources import resource_path
 
 _RENDERED = ("width_px", "height_px", "max_age_s")
 """What a drawn picture has of a camera's settings."""

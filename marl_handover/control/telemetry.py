@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.control.events import Event, SessionDigest
 from marl_handover.control.remote_control import CommandQueue, ControlFolder
@@ -247,8 +248,6 @@ def _replace(path: Path, content: str | bytes) -> None:
     """Write a file as a whole. Not flushed to the disk, as files are that have to outlive a loss of power: these tell of now."""
     write_whole(path, content, durable=False)
 
-
-Floats = NDArray[np.float64]
 
 _JOINT_DIGITS, _SEEN_DIGITS = 4, 3
 

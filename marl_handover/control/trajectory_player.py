@@ -14,8 +14,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.control.events import Event
 from marl_handover.control.workcell import Workcell
 from marl_handover.errors import InvalidSetting
@@ -34,8 +34,6 @@ from marl_handover.hardware.errors import (
 )
 from marl_handover.hardware.safety_filter import CommandRejected, JointCommand
 from marl_handover.motion.trajectory import LOADED_PHASES, Phase
-
-Floats = NDArray[np.float64]
 
 START_RAD = math.radians(3.0)
 """How far from where an arm has been sent its motion may begin."""

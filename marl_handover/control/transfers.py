@@ -8,17 +8,15 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from marl_handover.arrays import wrap
+from marl_handover.arrays import Floats, wrap
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.envs.cycle_check import FAILURES
 from marl_handover.learning.evaluation import judged_by
 from marl_handover.policies import SupervisorPolicy
 from marl_handover.task.episode import advance
 from marl_handover.task.rules import Outcome, Rules
-
-Floats = NDArray[np.float64]
 
 SAME_MM, SAME_RAD = 0.01, 1e-4
 """Poses nearer than this are the same: nothing was moved."""

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.control.settings import WorkcellConfig
@@ -20,13 +21,11 @@ from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.emulator.device import EmulatedCell, Fault
 from marl_handover.perception.calibration import Pixels, hung_camera
 from marl_handover.perception.camera import Frame, RenderedCamera
+from marl_handover.perception.markers import Sheet, marker_sheet
 from marl_handover.perception.scene import CellPainter, held_boards
-from marl_handover.perception.sheets import Sheet, marker_sheet
 from marl_handover.simulation.arm import SERVO_S
 from marl_handover.simulation.follower import ServoFollower, ServoState
 from marl_handover.simulation.world import BulletCell
-
-Floats = NDArray[np.float64]
 
 _BOOTED_S = 1.0
 _HAND_STEP_S, _HAND_S = 0.02, 1.0

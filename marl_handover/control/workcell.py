@@ -32,9 +32,8 @@ from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.perception.calibration import CameraCalibration
-from marl_handover.perception.camera import Camera
+from marl_handover.perception.camera import Camera, open_camera
 from marl_handover.perception.detector import Detector
-from marl_handover.perception.sources import open_camera
 from marl_handover.perception.tracker import Tracker
 
 CAMERA_FILE = "camera.json"

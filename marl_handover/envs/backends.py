@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.arrays import wrap
+from marl_handover.arrays import Floats, wrap
 from marl_handover.cell import CellModel
 from marl_handover.config import BACKENDS, MotionConfig, NoiseConfig, TaskConfig, require_at_least, require_between
 from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
@@ -22,8 +22,6 @@ from marl_handover.motion.trajectory import PickPlacePaths
 from marl_handover.task.rules import carried
 
 __all__ = ["BACKENDS", "Backend", "Correctable", "Execution", "KinematicBackend", "NoisyBackend", "Refusal", "make_backend"]
-
-Floats = NDArray[np.float64]
 
 
 class Execution(NamedTuple):

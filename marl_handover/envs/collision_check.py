@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.envs.cycle_check import CycleCheck
@@ -12,8 +12,6 @@ from marl_handover.motion.executor import ROLL_RAD
 from marl_handover.motion.path_optimizer import DENSE_SAMPLES, Segment
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import PickPlacePaths, sampled_basis
-
-Floats = NDArray[np.float64]
 
 SHORT_MM = 0.05
 """How far a path may fall short of a clearance: planned ones keep it exactly, but commands are float32, 1e-7 rad off, and paths are joined

@@ -6,14 +6,12 @@ import math
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.motion.trajectory import PickPlacePaths, knots, sampled_basis
-
-Floats = NDArray[np.float64]
 
 END_TOLERANCE_MM = 1.0
 """How far the grip may be from the object when it closes, and from the commanded place when it opens."""

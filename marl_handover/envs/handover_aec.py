@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv
 from pettingzoo.utils import wrappers
 
+from marl_handover.arrays import Floats
 from marl_handover.cell import CellModel, build_cell, cell_config
 from marl_handover.config import CellConfig, LoopConfig, MotionConfig, NoiseConfig, TaskConfig, require_between, require_choice
 from marl_handover.envs.backends import Backend, Correctable, KinematicBackend, make_backend
@@ -29,7 +30,6 @@ from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.episode import conclude, final_transfer, measured_verdict
 from marl_handover.task.rules import Command, Outcome, Rules, Verdict
 
-Floats = NDArray[np.float64]
 Observation = dict[str, Any]
 
 RENDER_MODES = ("rgb_array", "human")

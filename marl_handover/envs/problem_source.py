@@ -7,14 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from marl_handover.arrays import wrap
+from marl_handover.arrays import Floats, wrap
 from marl_handover.cell import Cell
 from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownKey
 from marl_handover.task.problems import sample_problems
-
-Floats = NDArray[np.float64]
 
 KEYS = ("state", "goal")
 """Of the options that set a problem."""

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary
 from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.envs.cycle_check import Refusal
@@ -17,8 +18,6 @@ from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.motion.executor import ARM_AGENTS
 from marl_handover.motion.trajectory import PickPlacePaths
 from marl_handover.task.rules import Rules
-
-Floats = NDArray[np.float64]
 
 REASONS = (Refusal.DECLINED, Refusal.OUT_OF_REACH, Refusal.NO_PATH)
 """What an arm's ``reason`` stands for; numbers as in :mod:`marl_handover.motion.executor`."""

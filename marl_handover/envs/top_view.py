@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell import Cell
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SIZE_PX = 320

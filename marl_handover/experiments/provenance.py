@@ -14,11 +14,10 @@ from typing import Any
 from marl_handover.compose import present_names
 from marl_handover.control.evaluation import AssessmentConfig
 from marl_handover.errors import HandoverError
-from marl_handover.files import read_bounded, write_whole
+from marl_handover.files import package_path, read_bounded, write_whole
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.parsing import LINES_BYTES, parse_json, read_json
 from marl_handover.policies.registry import content_hash
-from marl_handover.resources import package_path
 from marl_handover.task.rules import Outcome
 
 PLACES = ("out", "resume", "progress", "policy")

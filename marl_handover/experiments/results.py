@@ -11,17 +11,16 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.errors import HandoverError
 from marl_handover.experiments import statistics
 from marl_handover.experiments.provenance import REPORT_KEYS, TRAINED_KEYS, commits_of, fingerprint, read_record, settings_of
 from marl_handover.experiments.runs import RUN_FOLDER, TRAINED, Task
 from marl_handover.experiments.suite import BAR_MEASURES, REPORTED, RowSpec, Suite
-from marl_handover.report.metrics import Metrics, common_curve, read_metrics
+from marl_handover.learning.recorder import Metrics, common_curve, read_metrics
 from marl_handover.task.rules import Outcome
 
-Floats = NDArray[np.float64]
 Tree = dict[str, Any]
 
 NEVER = 1e18

@@ -22,8 +22,8 @@ from marl_handover.files import expanded
 from marl_handover.learning.recorder import machine
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.locks import held
+from marl_handover.policies.policy import SHIELDED
 from marl_handover.policies.registry import names
-from marl_handover.policies.shielded import SHIELDED
 
 ASKED, TRAINED, DONE = (f"{name}.json" for name in RECORDS)
 RUN_FOLDER = "run"

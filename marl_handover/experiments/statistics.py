@@ -14,11 +14,9 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.errors import MissingExtra
-
-Floats = NDArray[np.float64]
 
 REPETITIONS = 2000
 COVERAGE = 0.95

@@ -18,9 +18,9 @@ from omegaconf.errors import OmegaConfBaseException
 from marl_handover.compose import option_file
 from marl_handover.config import bounded, check_bounds, require_at_least, require_between, require_choice
 from marl_handover.errors import CorruptFile, HandoverError, InvalidSetting, UnknownChoice
+from marl_handover.files import resource_path
 from marl_handover.parsing import read_yaml
-from marl_handover.policies.shielded import SHIELDED
-from marl_handover.resources import resource_path
+from marl_handover.policies.policy import SHIELDED
 
 RUN = "{run}"
 """Stands for a trained row's run directory in the name of a policy."""

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.geometry.arm_model import LIMIT_TOLERANCE_RAD, ArmModel
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration
@@ -17,8 +18,6 @@ from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, 
 from marl_handover.hardware.settings import ARMS, PULSE_US, READING_US, SPEED_US_S, TIME_MS, GripperConfig, HardwareConfig
 from marl_handover.hardware.ssc32 import LineRecord, Ssc32, group_move, stop
 from marl_handover.hardware.transport import BITS_PER_BYTE
-
-Floats = NDArray[np.float64]
 
 
 class Wiring:

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from marl_handover.arrays import Floats
 from marl_handover.config import require_between, require_choice
 from marl_handover.errors import CorruptFile, HandoverError, MissingFile
 from marl_handover.files import keep, make_folder, read_bounded, write_together, write_whole
@@ -25,8 +26,6 @@ from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.settings import ARMS, PULSE_US, GripperConfig, HardwareConfig
 from marl_handover.parsing import JSON_BYTES, read_json
-
-Floats = NDArray[np.float64]
 
 VERSION = 1
 FITS = ("line", "pieces")

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.build import CellModel
 from marl_handover.compiled import compiled
 from marl_handover.geometry.capsules import capsule_pairs, joints_before
@@ -23,7 +24,6 @@ from marl_handover.geometry.kernels import FAR_MM, broad_phase, closest_points
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.collision_model import block_capsules
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 SETTLED_MM = 0.05

@@ -19,8 +19,8 @@ from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.hardware.board_group import Pulses, all_held, none_held, readback_middles
@@ -32,8 +32,6 @@ from marl_handover.hardware.expected_pulses import SETTLED_S
 from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.hardware.ssc32 import LineRecord
-
-Floats = NDArray[np.float64]
 
 
 class MoveRecord(NamedTuple):

@@ -19,8 +19,9 @@ from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.build import CellModel
 from marl_handover.errors import WorkFailed
 from marl_handover.geometry.arm_model import LIMIT_TOLERANCE_RAD
@@ -28,8 +29,6 @@ from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration
 from marl_handover.hardware.clearance import FAR_MM, alone_mm, arm_shapes, between_mm, still
 from marl_handover.hardware.settings import ARMS, HardwareConfig
-
-Floats = NDArray[np.float64]
 
 LAG_S = 0.05
 """Boards may be behind what they were sent by this much: two frames, and the line's own time."""

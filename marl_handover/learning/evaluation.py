@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from marl_handover.arrays import wrap
+from marl_handover.arrays import Floats, wrap
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.errors import CorruptFile, NotFinite, OutOfReach
 from marl_handover.files import read_bounded
@@ -23,8 +23,6 @@ from marl_handover.task.episode import Act, Decision, Episodes, Noise, Observer,
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules, carried
-
-Floats = NDArray[np.float64]
 
 EVALUATION_SEED = 1_000_000_000
 """Problems of reports come from seeds from here on; training and its validation use others, so these are never seen."""

@@ -30,9 +30,8 @@ from marl_handover.cell.build import urdf_path
 from marl_handover.compose import to_yaml
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.errors import CannotWrite, CorruptFile, HandoverError, MissingFile
-from marl_handover.files import MEGABYTE, cache_folder, read_arrays, writing
+from marl_handover.files import MEGABYTE, cache_folder, package_path, read_arrays, writing
 from marl_handover.progress import Bar
-from marl_handover.resources import package_path
 from marl_handover.task.rules import MotionCost, straight_line_mm
 
 Floats = NDArray[np.float64]

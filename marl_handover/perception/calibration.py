@@ -13,14 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from marl_handover.errors import CorruptFile, HandoverError, MissingFile, WorkFailed
+from marl_handover.arrays import Floats
+from marl_handover.errors import CorruptFile, HandoverError, MissingFile, WorkFailed, counted
 from marl_handover.files import copy_whole, make_folder, write_whole
 from marl_handover.parsing import read_json
+from marl_handover.perception.markers import board_corners_mm, charuco_board
 from marl_handover.perception.settings import BoardConfig, MountConfig
-from marl_handover.perception.sheets import board_corners_mm, charuco_board
-from marl_handover.wording import counted
 
-Floats = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
 LEAST_VIEWS, LEAST_CORNERS = 8, 8

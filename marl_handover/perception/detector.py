@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from marl_handover.arrays import wrap
 from marl_handover.config import BlockConfig
 from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels
-from marl_handover.perception.markers import Corners, MarkerFinder, opening_px
+from marl_handover.perception.markers import Corners, MarkerFinder, marker_cells, opening_px
 from marl_handover.perception.settings import DetectorConfig, TargetConfig
-from marl_handover.perception.sheets import marker_cells
 
 _LEAST_SATURATION, _LEAST_VALUE = 70, 40
 _AREA_TOLERANCE = 0.35

@@ -18,8 +18,8 @@ from marl_handover.geometry.se2 import SE2
 from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.geometry.urdf import Primitive
 from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels
+from marl_handover.perception.markers import Sheet, block_top, marker_sheet
 from marl_handover.perception.settings import LookConfig, TargetConfig
-from marl_handover.perception.sheets import Sheet, block_top, marker_sheet
 
 FINE = 4
 """Pixels of a fine window to one of the picture, each way."""

@@ -2,9 +2,8 @@
 
 from marl_handover.policies.actor import NetworkPolicy
 from marl_handover.policies.files import read_policy, stored_settings
-from marl_handover.policies.policy import SupervisorPolicy
+from marl_handover.policies.policy import ShieldedPolicy, SupervisorPolicy
 from marl_handover.policies.registry import POLICIES, ExactPolicy, GreedyPolicy, RandomPolicy, adapted, load, names
-from marl_handover.policies.shielded import ShieldedPolicy
 
 __all__ = [
     "POLICIES",

@@ -19,14 +19,12 @@ from marl_handover.arrays import select
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import CellConfig, CentralisedConfig, MotionConfig, TaskConfig
 from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, MissingFile, UnknownChoice, first_line
-from marl_handover.files import expanded
+from marl_handover.files import expanded, package_path
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.parsing import parse_object
 from marl_handover.plugins import Registry
 from marl_handover.policies.files import KINDS, read_policy, require_policy, stored_settings
-from marl_handover.policies.policy import Floats, SupervisorPolicy
-from marl_handover.policies.shielded import SHIELDED, ShieldedPolicy
-from marl_handover.resources import package_path
+from marl_handover.policies.policy import SHIELDED, Floats, ShieldedPolicy, SupervisorPolicy
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Rules
 

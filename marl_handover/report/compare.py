@@ -13,10 +13,10 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
 from marl_handover.cell import build_cell
 from marl_handover.config import CellConfig
-from marl_handover.report.figure_style import BLUE, FAINT, GREY, HATCHES, INK, OUTCOMES, PAPER, RED, series_marker, series_style
+from marl_handover.errors import counted
+from marl_handover.report.figure_style import BLUE, FAINT, GREY, HATCHES, INK, OUTCOMES, PAPER, RED, ruled, series_marker, series_style
 from marl_handover.report.plan import workspace_figure
 from marl_handover.report.table import Axes
-from marl_handover.wording import counted
 
 Tree = Mapping[str, Any]
 
@@ -158,12 +158,9 @@ def _named(axes: Axes, rows: list[Any]) -> None:
 
 
 def _ruled(axes: Axes) -> None:
-    axes.grid(axis="x", color=FAINT, linewidth=0.5)
-    axes.set_axisbelow(True)
+    ruled(axes, "x")
     axes.tick_params(axis="x", labelsize=8)
     axes.tick_params(axis="y", length=0)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
 
 
 def _titled(figure: Figure, spec: Tree) -> None:

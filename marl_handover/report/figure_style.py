@@ -104,3 +104,11 @@ SERIES_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 def series_marker(index: int) -> str:
     """Marker of the curve of that index."""
     return SERIES_MARKERS[index % len(SERIES_MARKERS)]
+
+
+def ruled(axes: Any, axis: str = "y") -> None:
+    """Faint lines behind what is drawn, at the ticks of ``axis``, and no frame above or to the right."""
+    axes.grid(axis=axis, color=FAINT, linewidth=0.5)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
+from marl_handover.learning.recorder import Metrics, common_curve
 from marl_handover.report.figure_style import BLUE, FAINT, GREY, INK, RED, YELLOW
-from marl_handover.report.metrics import Metrics, common_curve
 from marl_handover.report.table import Axes
 
 LONGEST = 64

@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.build import CellModel
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import MotionConfig
@@ -25,10 +25,8 @@ from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.collision_model import block_capsules
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import LOADED_PHASES, PHASES, Phase, PickPlacePaths, TransferMotion
-from marl_handover.report.figure_style import BLUE, FAINT, GREY, INK, PAPER, RED, YELLOW, arm_colour
+from marl_handover.report.figure_style import BLUE, FAINT, GREY, INK, PAPER, RED, YELLOW, arm_colour, ruled
 from marl_handover.report.table import Axes, draw_bases, draw_sectors, frame_table
-
-Floats = NDArray[np.float64]
 
 JOINT_STYLES: tuple[tuple[str, Any], ...] = ((BLUE, "-"), (RED, (0, (6, 1.5))), (YELLOW, "-."), (INK, "--"), (GREY, ":"))
 """Colour and line of each joint: told apart without colours too."""
@@ -172,7 +170,7 @@ def _draw_side(axes: Axes, motions: Sequence[TransferMotion], model: CellModel) 
     axes.set_title("and from the side, along x", fontsize=9)
     axes.set_xlabel("y [mm]")
     axes.set_ylabel("z [mm]")
-    _tidy(axes)
+    ruled(axes)
 
 
 def _draw_path(axes: Axes, motion: TransferMotion, model: CellModel, plane: tuple[int, int]) -> None:
@@ -200,7 +198,7 @@ def _draw_joints(axes: Axes, motions: Sequence[TransferMotion]) -> None:
     ]
     axes.legend(handles=handles, fontsize=8, ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.03), frameon=False, columnspacing=1.2)
     axes.set_ylabel("joint of the moving arm [deg]")
-    _tidy(axes)
+    ruled(axes)
 
 
 def _draw_clearance(axes: Axes, motions: Sequence[TransferMotion], model: CellModel, settings: MotionConfig) -> None:
@@ -222,7 +220,7 @@ def _draw_clearance(axes: Axes, motions: Sequence[TransferMotion], model: CellMo
     axes.set_ylim(0.0, SHOWN_MM * 1.03)
     axes.set_ylabel(f"clearance, up to {SHOWN_MM:.0f} [mm]")
     axes.set_xlabel("t [s]")
-    _tidy(axes)
+    ruled(axes)
 
 
 def _shade(axes: Axes, motions: Sequence[TransferMotion], starts: Floats, labels: bool = True) -> None:
@@ -238,13 +236,6 @@ def _shade(axes: Axes, motions: Sequence[TransferMotion], starts: Floats, labels
                 xytext=(0, 2), textcoords="offset points", fontsize=8, ha="center", color=arm_colour(motion.arm),
             )  # fmt: skip
     axes.set_xlim(0.0, starts[-1])
-
-
-def _tidy(axes: Axes) -> None:
-    axes.grid(axis="y", color=FAINT, linewidth=0.5)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
 
 
 class NoMotion(WorkFailed):

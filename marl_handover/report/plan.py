@@ -14,10 +14,9 @@ from matplotlib.lines import Line2D
 from marl_handover.cell import CellModel
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.errors import CorruptFile
+from marl_handover.errors import CorruptFile, counted
 from marl_handover.report.figure_style import FAINT, GOAL, GREY, INK, SHARED, arm_colour
 from marl_handover.report.table import Axes, bare, draw_bases, draw_block, draw_chart, draw_circles, draw_sectors, frame_table
-from marl_handover.wording import counted
 
 
 def workspace_figure(model: CellModel) -> Figure:

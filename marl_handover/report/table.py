@@ -8,16 +8,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib.patches import Circle, Polygon
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.report.figure_style import FAINT, INK, PAPER, arm_colour, arm_line
 
 Axes = Any
 """matplotlib's, which has no types of its own here."""
-
-Floats = NDArray[np.float64]
 
 
 def sector_mm(cell: Cell, arm: int, points: int = 90) -> Floats:

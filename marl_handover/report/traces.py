@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import LoopConfig
@@ -18,7 +19,6 @@ from marl_handover.files import read_lines
 from marl_handover.parsing import LINES_BYTES, parse_object
 from marl_handover.task.rules import ROUNDING_RAD, Command, Outcome, Rules
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 

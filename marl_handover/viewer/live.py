@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell import CellModel, build_cell
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
@@ -25,14 +25,13 @@ from marl_handover.config import BlockConfig, CellConfig
 from marl_handover.control.events import FAULTS
 from marl_handover.control.remote_control import MAX_AGE_S, SessionCommand
 from marl_handover.control.telemetry_reader import Reading, TelemetryReader
-from marl_handover.errors import HandoverError
+from marl_handover.errors import HandoverError, counted
 from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.hardware.settings import ARMS
 from marl_handover.palette import ALERT, BLUE, GREY, INK, PAPER, YELLOW
 from marl_handover.viewer import live as live_words
 from marl_handover.viewer.scene import CellScene
 from marl_handover.viewer.words import DOING, at_once
-from marl_handover.wording import counted
 
 RESTING = {"armed": "holds"}
 """What an arm does that does not move, by the driver's state; else that itself."""
@@ -192,8 +191,6 @@ def _table(rows: Iterable[Sequence[str]], escaped: bool = False) -> str:
     lines = ("".join(f'<td style="{_CELL}">{cell if escaped else html.escape(cell)}</td>' for cell in row) for row in rows)
     return f'<div style="{_SMALL}"><table style="border-collapse:collapse">{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
 
-
-Floats = NDArray[np.float64]
 
 LOG_LINES = 30
 STOP_REASON = "STOP pressed in the browser"

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from marl_handover.arrays import Floats
 from marl_handover.cell import Cell
 from marl_handover.config import require_choice
 from marl_handover.control.interactive.cell import InteractiveCell, Snapshot
@@ -18,8 +19,6 @@ from marl_handover.errors import HandoverError
 from marl_handover.policies import SupervisorPolicy
 from marl_handover.viewer.scene import CellScene
 from marl_handover.viewer.words import at_once, by_hand, decision_words, flat, number, plain, score_words, state_words, write, yaw_of
-
-Floats = NDArray[np.float64]
 
 SIZE_M = 0.06
 _LEAST_SLOPE = 1e-3

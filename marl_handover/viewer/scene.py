@@ -10,6 +10,7 @@ import numpy as np
 import viser
 from numpy.typing import ArrayLike, NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell import Cell, CellModel
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import BlockConfig
@@ -17,8 +18,6 @@ from marl_handover.geometry.se3 import transform
 from marl_handover.geometry.urdf import ARM_JOINTS, Joint, Primitive
 from marl_handover.palette import ALERT, GOAL, GREY, INK, SHARED, arm_colour
 from marl_handover.viewer.words import UPWARDS, Colour, flat, metres, product, quaternion, rgb, turned
-
-Floats = NDArray[np.float64]
 
 BEECH = (214, 170, 110)
 

@@ -12,6 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig, TaskConfig
 from marl_handover.control.interactive.world_state import lying
@@ -22,8 +23,6 @@ from marl_handover.task.rules import Rules
 from marl_handover.viewer.scene import CellScene
 from marl_handover.viewer.trace_file import Moment, Recorded, Step, Trace
 from marl_handover.viewer.words import arm_name, by_hand, degrees_words, error_words, number, place_words, plain, write
-
-Floats = NDArray[np.float64]
 
 STRAIGHT_S = 1.5
 _STRAIGHT_SAMPLES = 31

@@ -7,16 +7,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.errors import CorruptFile, InvalidSetting
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.parsing import read_rows
 from marl_handover.task.rules import Outcome
-
-Floats = NDArray[np.float64]
 
 WHAT = "trace file"
 OUTCOMES = tuple(outcome.name.lower() for outcome in Outcome if outcome is not Outcome.NONE)

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.control.interactive.cell import Placement, Snapshot
+from marl_handover.errors import counted
 from marl_handover.task.rules import Rules
-from marl_handover.wording import counted
 
-Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 UPWARDS = (0.0, 0.0, 1.0)

@@ -11,8 +11,8 @@ import pytest
 
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.cli import main
-from marl_handover.commands.person import Person, confirmed
 from marl_handover.config import MotionConfig
+from marl_handover.control.calibration import TerminalOperator, confirmed
 from marl_handover.control.settings import CardConfig, twin_workcell
 from marl_handover.errors import WorkFailed
 from marl_handover.hardware.calibration import load_backlash, load_calibration, nominal_calibration, require_one_set
@@ -142,4 +142,4 @@ def test_without_a_terminal_nobody_is_there(monkeypatch):
     monkeypatch.setattr("sys.stdin", open("/dev/null"))  # noqa: SIM115 - closed with the process
     assert not confirmed("Is the way free?")
     with pytest.raises(WorkFailed, match="terminal"):
-        Person(CardConfig()).glue_cards()
+        TerminalOperator(CardConfig()).glue_cards()

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from marl_handover import cli
-from marl_handover.resources import resource_path
+from marl_handover.files import resource_path
 
 URDF = Path(resource_path("urdf/al5a.urdf")).read_text()
 STEP = {"episode": 0, "step": 0, "state": [-120, -60, 0], "goal": [150, 60, 1], "arm": "L", "final": False, "place": [-44, 0]}

@@ -12,7 +12,7 @@ from marl_handover.cell.build import build_cell, cell_config
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.commands.plan import solve
 from marl_handover.config import MotionConfig, TaskConfig
-from marl_handover.control.interactive.policy_adapter import PolicyAdapter, Score
+from marl_handover.control.interactive.controller import PolicyAdapter, Score
 from marl_handover.errors import InvalidSetting
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.task.planner import ExactPlanner

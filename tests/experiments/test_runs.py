@@ -32,11 +32,11 @@ from marl_handover.experiments.runs import (
     plan_tasks,
 )
 from marl_handover.experiments.suite import load_suite
+from marl_handover.files import package_path
 from marl_handover.learning import trainer
 from marl_handover.learning.evaluation import random_problems
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.trainer import Trainer
-from marl_handover.resources import package_path
 from marl_handover.task.rules import Rules
 
 TRAIN, EVALUATE = Grammar(train.ALIASES, train.GROUPS), Grammar(evaluate.ALIASES, evaluate.GROUPS)

@@ -18,8 +18,7 @@ from optuna.trial import TrialState, create_trial
 from marl_handover.commands.train import resumed
 from marl_handover.errors import CorruptFile, UnknownKey
 from marl_handover.experiments import tune
-from marl_handover.experiments.tune import ChangedStudy, Search, prepare, run_trial, run_trials
-from marl_handover.experiments.tune_space import applied, load_space, value_of
+from marl_handover.experiments.tune import ChangedStudy, Search, applied, load_space, prepare, run_trial, run_trials, value_of
 from marl_handover.experiments.tune_storage import (
     TRIES,
     abandoned,
@@ -32,9 +31,9 @@ from marl_handover.experiments.tune_storage import (
     place_of,
     running,
 )
+from marl_handover.files import resource_path
 from marl_handover.learning.settings import ALGORITHMS, OffPolicyConfig, TrainConfig
 from marl_handover.learning.trainer import validation_score
-from marl_handover.resources import resource_path
 
 SPACES = resource_path("configs") / "search"
 SPACE = "algorithm.gamma: {type: float, low: 0.9, high: 0.99}\nalgorithm.batch_size: {type: categorical, choices: [32, 64]}\n"

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from marl_handover.files import resource_path
 from marl_handover.geometry.capsules import enclosing_capsule, ground_clearance_mm, segment_distance, self_clearance_mm
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.se3 import transform
 from marl_handover.geometry.urdf import Primitive, read_urdf
-from marl_handover.resources import resource_path
 
 ARM = ClosedFormArm(read_urdf(resource_path("urdf/al5a.urdf")))
 LINKS = {link.name: link for link in ARM.description.links}

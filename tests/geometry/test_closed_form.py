@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from marl_handover.arrays import wrap
 from marl_handover.errors import InvalidSetting, UnknownKey, UnsupportedKinematics
+from marl_handover.files import resource_path
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.closed_form import ClosedFormArm, grip_in_plane, grip_speed, planar_ik
 from marl_handover.geometry.se3 import rotation, transform
 from marl_handover.geometry.urdf import ARM_JOINTS, ArmDescription, read_urdf
-from marl_handover.resources import resource_path
 
 SHIPPED = resource_path("urdf/al5a.urdf")
 DESCRIPTION = read_urdf(SHIPPED)

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from marl_handover.errors import MissingFile, UrdfError
+from marl_handover.files import resource_path
 from marl_handover.geometry.urdf import ARM_JOINTS, read_urdf
-from marl_handover.resources import resource_path
 
 SHIPPED = resource_path("urdf/al5a.urdf")
 TEXT = SHIPPED.read_text(encoding="utf-8")

@@ -13,6 +13,7 @@ from marl_handover.commands import emulate
 from marl_handover.compose import compose, from_text, to_yaml
 from marl_handover.config import BlockConfig
 from marl_handover.errors import HandoverError, InvalidSetting, UnknownChoice
+from marl_handover.files import resource_path
 from marl_handover.hardware.board_group import Wiring, finger_mm, gripper_pulse_us
 from marl_handover.hardware.calibration import nominal_calibration
 from marl_handover.hardware.clock import VirtualClock
@@ -21,7 +22,6 @@ from marl_handover.hardware.errors import PortNotFound
 from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.hardware.settings import ARMS, GripperConfig, HardwareConfig
 from marl_handover.hardware.transport import choose_port, list_serial_ports
-from marl_handover.resources import resource_path
 
 FILES = sorted(resource_path("configs/hardware").glob("*.yaml"))
 

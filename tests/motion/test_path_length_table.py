@@ -14,10 +14,10 @@ from marl_handover.cell import Cell, build_cell, cell_config
 from marl_handover.config import MotionConfig, RewardConfig, TaskConfig
 from marl_handover.envs import SupervisorEnv, SupervisorGoalEnv
 from marl_handover.errors import CorruptFile, MissingFile
+from marl_handover.files import package_path
 from marl_handover.motion import path_length_table as tables
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import adapted, load
-from marl_handover.resources import package_path
 from marl_handover.task.rules import Rules, straight_line_mm
 from tests.symmetries import GROUP
 

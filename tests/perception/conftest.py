@@ -11,10 +11,10 @@ import pytest
 from marl_handover.config import MotionConfig
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.calibration import CameraCalibration, calibrate_lens, hung_camera
+from marl_handover.perception.markers import charuco_sheet
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.perception.settings import BoardConfig, LookConfig, MountConfig
-from marl_handover.perception.sheets import charuco_sheet
 
 SIZE_PX = (1280, 720)
 PLACES = ((-80.0, 0.0, math.pi / 2), (80.0, 10.0, -math.pi / 2))

@@ -3,8 +3,8 @@ import pytest
 
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.calibration import CalibrationFailed, CameraCalibration, Intrinsics, calibrate_lens
+from marl_handover.perception.markers import charuco_sheet
 from marl_handover.perception.scene import Renderer, held_boards, sheet_shape
-from marl_handover.perception.sheets import charuco_sheet
 
 
 def test_the_lens_is_found_from_rendered_boards(lens, truth):

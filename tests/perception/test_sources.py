@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, UnknownChoice
-from marl_handover.perception.camera import EndOfFrames, NoCamera
+from marl_handover.perception.camera import EndOfFrames, NoCamera, cameras_found, open_camera
 from marl_handover.perception.settings import CameraConfig
-from marl_handover.perception.sources import cameras_found, open_camera
 
 
 def picture(value):

@@ -16,10 +16,9 @@ import torch
 
 from marl_handover import policies
 from marl_handover.errors import CorruptFile, HandoverError
-from marl_handover.files import read_arrays
+from marl_handover.files import package_path, read_arrays
 from marl_handover.learning.checkpoint import FILE, load_checkpoint
 from marl_handover.policies.files import LIMIT_BYTES
-from marl_handover.resources import package_path
 
 GOOD = package_path("pretrained/b.npz")
 STORED_RUN = Path(__file__).parents[1] / "data" / "run_0_1"

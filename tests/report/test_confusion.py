@@ -9,7 +9,7 @@ from marl_handover.cell import load_cell
 from marl_handover.config import TaskChanges, TaskConfig
 from marl_handover.control.evaluation import AssessmentConfig, assess
 from marl_handover.errors import InvalidSetting
-from marl_handover.report.errors import endings_against, meant_figure
+from marl_handover.report.evaluation import endings_against, meant_figure
 from marl_handover.report.traces import read_trace
 from marl_handover.task.rules import Outcome, Rules
 

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.patches import Rectangle
 
-from marl_handover.report.errors import SCALES, errors_figure
+from marl_handover.report.evaluation import SCALES, errors_figure
 from marl_handover.report.figure_style import OUTCOMES
 from marl_handover.report.traces import Trace
 from marl_handover.task.rules import Outcome

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from marl_handover.errors import CorruptFile, MissingFile
-from marl_handover.learning.recorder import COLUMNS
+from marl_handover.learning.recorder import COLUMNS, NEEDED, OPTIONAL, common_curve, read_metrics
 from marl_handover.report.learning import stage_changes
-from marl_handover.report.metrics import NEEDED, OPTIONAL, common_curve, read_metrics
 
 
 def write(folder, text):

@@ -13,21 +13,18 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from marl_handover.arrays import wrap
+from marl_handover.arrays import Floats, wrap
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig, require_at_least, require_seed
-from marl_handover.control.interactive.controller import InteractiveController
-from marl_handover.control.interactive.policy_adapter import Placement, PolicyAdapter
+from marl_handover.control.interactive.controller import InteractiveController, Placement, PolicyAdapter
 from marl_handover.control.interactive.world_state import projected
 from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import SupervisorPolicy
 
 __all__ = ["InteractiveCell", "Placement", "Snapshot"]
-
-Floats = NDArray[np.float64]
 
 NEXT = -1
 """Instead of a problem's seed."""

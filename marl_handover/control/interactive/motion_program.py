@@ -12,8 +12,8 @@ from dataclasses import replace
 from itertools import takewhile
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.control.interactive.world_state import MotionSegment, WorldState
 from marl_handover.control.transfers import TransferCommand
 from marl_handover.errors import WorkFailed
@@ -24,8 +24,6 @@ from marl_handover.motion.pick_place import motion_limits
 from marl_handover.motion.planner import STILL_MM, MotionPlanner, detour_length, string_length
 from marl_handover.motion.time_parametrization import time_path
 from marl_handover.motion.trajectory import JointTrajectory, still
-
-Floats = NDArray[np.float64]
 
 STEP_S = 0.002
 """Between samples: accelerations jump in time-optimal motions, and a cubic across such a jump is off for no longer than this."""

@@ -8,14 +8,12 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.build import CellModel
 from marl_handover.geometry.se3 import transform
 from marl_handover.motion.pick_place import LIFTED_MM
 from marl_handover.motion.trajectory import JointTrajectory
-
-Floats = NDArray[np.float64]
 
 NOBODY = -1
 

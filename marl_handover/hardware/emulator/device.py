@@ -11,8 +11,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from marl_handover.arrays import Floats
 from marl_handover.config import require_choice
 from marl_handover.errors import BadOverride
 from marl_handover.geometry.arm_model import ArmModel
@@ -265,9 +266,6 @@ class EmulatedDevice:
             for number, servo in self.servos.items():
                 servo.step(self.board.channels[number].output(frame) if self._powered else 0.0, until_s - self._now_s)
             self._now_s = until_s
-
-
-Floats = NDArray[np.float64]
 
 
 class EmulatedCell:
