@@ -77,7 +77,7 @@ def bodies_of(model: CellModel) -> Bodies:
         inside = np.eye(4) if body == 0 else np.linalg.inv(frames[moved[body - 1]])
         ends = [(inside @ frames[capsule.link] @ np.append(end, 1.0))[:3] for end in (capsule.start_mm, capsule.end_mm)]
         rows.append([body, *ends[0], *ends[1], capsule.radius_mm])
-    bare, block, drop = len(rows), model.cell.config.block, model.cell.config.pick_height_mm
+    bare, block, drop = len(rows), model.cell.config.block, model.cell.pick_height_mm
     grip = (np.linalg.inv(frames[moved[4]]) @ frames[description.grasp_link])[:3, 3]
     capsules = block_capsules(block, drop)
     for capsule in [*capsules[-1:], *capsules[:-1]]:

@@ -57,6 +57,9 @@ RENAMED = {
 }
 """Keys of 0.1 and what they are called now, each without its section. Who types one is told; what was stored with one is read."""
 
+SYNONYMS = {"urdf": "robot"}
+"""Older keys that still may be typed, each without its section, and what they are called now."""
+
 RENAMED_OPTIONS = {("algorithm", "box_sac"): "flat_sac"}
 """The same of options that are chosen by name."""
 
@@ -113,6 +116,11 @@ def from_text(schema: type, text: str, origin: Path, groups: Groups | None = Non
     except ValueError as error:
         raise CorruptFile("configuration in", origin, str(error)) from error
     return _fitted_tree(schema, tree, origin, groups, stored)
+
+
+def from_mapping(schema: type, tree: Mapping[str, Any], origin: Path) -> Any:
+    """As :func:`from_text`, of what a program stored in ``origin``, already parsed."""
+    return _fitted_tree(schema, tree, origin, None, stored=True)
 
 
 def present_names(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -183,7 +191,10 @@ class _Composer:
             key = self.aliases[key]
         elif first in self.aliases and rest:
             key = f"{self.aliases[first]}.{rest}"
-        return _Argument(text, tuple(key.split(".")), raw.strip())
+        keys = tuple(key.split("."))
+        if keys[-1] in SYNONYMS and self.tree.has((*keys[:-1], SYNONYMS[keys[-1]])) and not self.tree.has(keys):
+            keys = (*keys[:-1], SYNONYMS[keys[-1]])
+        return _Argument(text, keys, raw.strip())
 
     def run(self, arguments: list[_Argument]) -> Any:
         """Apply choices, preset and values, weakest first."""
@@ -238,8 +249,9 @@ class _Composer:
                 name = RENAMED_OPTIONS.get((".".join(keys), name), name)
                 tree = {**tree, "name": name}
             self._choose(keys, _Choice(name, file))
+        names = self.tree.names(keys)
+        tree = {SYNONYMS[key] if key not in names and SYNONYMS.get(key) in names else key: value for key, value in tree.items()}
         if self.stored:
-            names = self.tree.names(keys)
             tree = {RENAMED[key] if key not in names and RENAMED.get(key) in names else key: value for key, value in tree.items()}
         for key, value in tree.items():
             path = (*keys, str(key))

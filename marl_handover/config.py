@@ -29,6 +29,7 @@ from marl_handover.plugins import Registry
 
 __all__ = [
     "BACKENDS",
+    "CELL_ALIASES",
     "LAYOUTS",
     "MAX_SEED",
     "ArmConfig",
@@ -40,6 +41,7 @@ __all__ = [
     "MotionConfig",
     "NoiseConfig",
     "RewardConfig",
+    "RobotConfig",
     "TaskChanges",
     "TaskConfig",
     "bounded",
@@ -73,6 +75,8 @@ BACKENDS: Registry[Any] = Registry(
     },
 )
 """Classes with the methods of :class:`~marl_handover.envs.backends.Backend`, called with a model, motion settings and own options."""
+SHAPES = ("file", "links", "none")
+APPROACHES = ("", "+x", "-x", "+y", "-y", "+z", "-z")
 MOTION_METHODS = ("optimised", "paper")
 EXPLORATIONS = ("chart", "area")
 LEARNERS = ("independent", "shared", "ctde")
@@ -111,15 +115,29 @@ class BlockConfig:
                 raise InvalidSetting(f"cell.block.{name}", getattr(self, name), limit)
 
 
-def _paper_limits() -> dict[str, list[float]]:
-    """Joint limits for which the 5 mm grid fits the paper's annulus: the elbow's upper stop gives r_max, the wrist's r_min."""
-    return {
-        "base_yaw": [-90.0, 90.0],
-        "shoulder": [-14.0, 150.0],
-        "elbow": [-168.0, -108.5],
-        "wrist_pitch": [-95.0, 95.0],
-        "wrist_roll": [-90.0, 90.0],
-    }
+@dataclass
+class RobotConfig:
+    """One kind of robot: its URDF, and what is not to be found out from it.
+
+    Roles of joints: ``base_yaw``, ``shoulder``, ``elbow``, ``wrist_pitch``, ``wrist_roll``. What is empty or null is found by geometry.
+    """
+
+    name: str = ""
+    urdf: str = path_field("")  # a path, which counts from the folder of this robot's YAML file, or the name of a file in urdf/
+    tip: str = ""  # link in whose origin things are held
+    joints: dict[str, str] = sized(dict, 0, 5)  # role -> joint of the URDF
+    locked: dict[str, float] = bounded(dict, -360.0, 360.0, (0, 64))  # joint of the URDF -> the angle [deg] at which it is held
+    approach: str = chosen("", APPROACHES)  # where the hand points, in the tip's frame
+    gripper: list[str] = sized(list, 0, 2)  # its joints; [none]: things stick to the tip
+    joint_limits_deg: dict[str, list[float]] = bounded(dict, -360.0, 360.0, (0, 64), (2, 2))  # role -> limits in place of the URDF's
+    pitch_deg: float = bounded(0.0, -90.0, 90.0)  # of the hand where it picks and places: 0 level, -60 steeply down
+    pick_height_mm: float = bounded(45.0, 0.1, 1000.0)  # of the grip over the table
+    parked_deg: list[float] | None = bounded(None, -360.0, 360.0, (5, 5))  # joints by role while another arm moves; null: found
+    shapes: str = chosen("file", SHAPES)  # file: the URDF's; links: capsules along the links; none
+
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
+        check_bounds(self, "robot.")
 
 
 @dataclass
@@ -130,20 +148,25 @@ class ArmConfig:
     x_mm: float = bounded(0.0, -10_000.0, 10_000.0)
     y_mm: float = bounded(0.0, -10_000.0, 10_000.0)
     facing_deg: float = bounded(0.0, -360.0, 360.0)  # world direction of zero yaw
-    robot: str = path_field("")  # a URDF, as for cell.urdf, with its own joint limits; empty: the cell's
+    robot: str = path_field("")  # as cell.robot; empty: the cell's
 
 
 @dataclass
 class CellConfig:
-    """Arms around a shared piece of table; the defaults are the paper's cell, two mirrored arms of one URDF."""
+    """Arms around a shared piece of table; the defaults are the paper's cell, two mirrored arms of one robot.
+
+    What robots have, too, is put over every arm's own; null, or empty, leaves it.
+    """
 
     name: str = "paper"
-    urdf: str = path_field("al5a.urdf")  # a path, or the name of a file in urdf/
-    grasp_link: str = "grip"
+    robot: str = path_field("al5a_paper")  # the name of a file in configs/robot, or the path of a robot's YAML file or URDF
     arms: list[ArmConfig] = sized(list, 0, 16)  # one entry an arm; empty: a mirrored pair, its bases base_distance_mm apart
     base_distance_mm: float = bounded(360.0, 10.0, 10_000.0)
-    pick_height_mm: float = bounded(45.0, 0.1, 1000.0)
-    joint_limits_deg: dict[str, list[float]] = bounded(_paper_limits, -360.0, 360.0, (0, 64), (2, 2))  # replace the URDF's, joint by joint
+    grasp_link: str = ""  # the robots' tip
+    pick_height_mm: float | None = bounded(None, 0.1, 1000.0)
+    pitch_deg: float | None = bounded(None, -90.0, 90.0)
+    joint_limits_deg: dict[str, list[float]] = bounded(dict, -360.0, 360.0, (0, 64), (2, 2))  # joint by joint
+    shapes: str | None = chosen(None, SHAPES)
     grid_mm: float = bounded(5.0, 1.0, 200.0)
     fit_rounding_mm: float = bounded(1.0, 0.0, 100.0)  # fitted radii are rounded inwards to a multiple of this; 0 keeps them
     chart_inset: float = bounded(1.0, 0.1, 1.0)  # part of the chart that is used: 1 = all, 0.95 leaves room for placement noise
@@ -154,15 +177,9 @@ class CellConfig:
         check_bounds(self, "cell.")
         self.block.validate()
 
-    def require_grip(self, finger_travel_mm: float) -> None:
-        """Raise :class:`InvalidSetting` if hands that open so far cannot close on the pin; for whatever carries the block."""
-        low, high = self.block.height_mm, self.block.pin_top_mm
-        if not low < self.pick_height_mm < high:
-            limit = f"between cell.block.height_mm = {low:g} and cell.block.pin_top_mm = {high:g}: the hand closes on the pin"
-            raise InvalidSetting("cell.pick_height_mm", self.pick_height_mm, limit)
-        if self.block.pin_diameter_mm >= 2 * finger_travel_mm:
-            limit = f"above {self.block.pin_diameter_mm / 2:g}, half of cell.block.pin_diameter_mm: fingers have to pass the pin"
-            raise InvalidSetting("motion.finger_travel_mm", finger_travel_mm, limit)
+
+CELL_ALIASES = {key: f"cell.{key}" for key in ("robot", "shapes")}
+"""Short keys of commands that have a cell."""
 
 
 @dataclass

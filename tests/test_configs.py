@@ -9,6 +9,7 @@ from marl_handover.cell import load_cell
 from marl_handover.commands import evaluate, train
 from marl_handover.compose import compose, from_text, to_yaml
 from marl_handover.files import resource_path
+from marl_handover.geometry.robot import robot_config
 
 CONFIGS = resource_path("configs")
 FILES = {folder.name: sorted(path.stem for path in folder.glob("*.yaml")) for folder in CONFIGS.iterdir() if folder.is_dir()}
@@ -19,7 +20,7 @@ def named(group):
 
 
 def test_every_file_belongs_to_a_group_that_is_tested_here():
-    assert {path.parent.name for path in CONFIGS.rglob("*.yaml")} == {"cell", "hardware", "preset", "search", "suite"}
+    assert {path.parent.name for path in CONFIGS.rglob("*.yaml")} == {"cell", "hardware", "preset", "robot", "search", "suite"}
     assert "paper" in named("cell")
     assert "smoke" in named("preset")
 
@@ -50,3 +51,14 @@ def test_cell_loads_and_builds(command, name):
     config = compose(command.SCHEMA, [f"cell={name}"], groups=command.GROUPS, aliases=command.ALIASES)
     assert config.cell.name == name
     assert load_cell(config.cell).config == config.cell
+
+
+@pytest.mark.parametrize("name", named("robot"))
+def test_robot_loads_and_stands_in_a_cell(name):
+    config = robot_config(name)
+    config.validate()
+    assert config.name == name
+    for given in (f"robot={name}", f"cell.urdf={name}"):
+        composed = compose(train.SCHEMA, [given, "cell.base_distance_mm=420"], groups=train.GROUPS, aliases=train.ALIASES)
+        assert composed.cell.robot == name
+    assert [arm.robot for arm in load_cell(composed.cell).arms] == [name] * 2

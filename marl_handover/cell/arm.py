@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from marl_handover.config import RobotConfig
 from marl_handover.geometry.se2 import SE2
 
 REACH_TOLERANCE_MM = 1e-3
@@ -23,6 +24,7 @@ class Arm:
         r_min_mm, r_max_mm: radii of the annulus around its base in which it can pick and place.
         yaw_rad: (lower, upper) base yaw about its facing.
         robot: which robot it is: arms of the same robot move alike.
+        pick_height_mm: how high over the table its grip is where it picks and places.
         mirror: -1 for an arm that is built or seen as the mirror image of the others, else 1.
     """
 
@@ -33,6 +35,7 @@ class Arm:
     yaw_rad: tuple[float, float]
     robot: str = ""
     mirror: int = 1
+    pick_height_mm: float = RobotConfig.pick_height_mm
 
     def reaches(self, position_mm: ArrayLike) -> NDArray[np.bool_]:
         """Whether it can place at world positions (..., 2), to :data:`REACH_TOLERANCE_MM`: (...)."""

@@ -1,23 +1,23 @@
-"""From settings to a cell: URDF -> arm -> 5 mm grid -> annulus fit -> :class:`Cell`."""
+"""From settings to a cell: robots -> arms -> 5 mm grid -> annulus fit -> :class:`Cell`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import replace
 from typing import NamedTuple
 
 from marl_handover.cell.arm import Arm, mirrored_pair
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.reach import AnnulusFit, ManipulationGrid, fit_annulus, manipulation_grid
 from marl_handover.compose import from_yaml, to_yaml
-from marl_handover.config import CellConfig, require_choice
-from marl_handover.errors import InvalidSetting, MissingFile, UnequalArms
+from marl_handover.config import CellConfig, RobotConfig, require_choice
+from marl_handover.errors import InvalidSetting, UnequalArms
 from marl_handover.files import expanded, resource_path
 from marl_handover.geometry.capsules import base_radius_mm
 from marl_handover.geometry.closed_form import ClosedFormArm
+from marl_handover.geometry.robot import read_robot, robot_config
 from marl_handover.geometry.se2 import SE2
-from marl_handover.geometry.urdf import read_urdf
 
 
 class CellModel(NamedTuple):
@@ -28,12 +28,14 @@ class CellModel(NamedTuple):
         arms: each arm's kinematics.
         grid: what each of them reaches, point by point.
         fits: the annulus sector that stands for it; arms of one robot have one in common.
+        robots: each arm's robot, with what the cell says for all arms.
     """
 
     cell: Cell
     arms: tuple[ClosedFormArm, ...]
     grid: ManipulationGrid
     fits: tuple[AnnulusFit, ...]
+    robots: tuple[RobotConfig, ...]
 
     @property
     def arm(self) -> ClosedFormArm:
@@ -50,17 +52,6 @@ class CellModel(NamedTuple):
         return self.fits[0]
 
 
-def urdf_path(urdf: str) -> Path:
-    """A URDF by path, or by the name of a shipped one."""
-    path = expanded(urdf)
-    if path.exists() or path.parent != Path():
-        return path
-    try:
-        return resource_path(f"urdf/{urdf}")
-    except MissingFile as error:
-        raise MissingFile("URDF", urdf, "name a file here, a path, or one of those that are shipped: al5a.urdf") from error
-
-
 def build_cell(config: CellConfig) -> CellModel:
     """Compute the cell of ``config``.
 
@@ -69,25 +60,28 @@ def build_cell(config: CellConfig) -> CellModel:
     """
     config.validate()
     names, bases, robots, mirrors = _standing(config)
-    models = {robot: _robot(config, robot) for robot in dict.fromkeys(robots)}
+    settings = {robot: robot_of(config, robot) for robot in dict.fromkeys(robots)}
+    models = {robot: read_robot(each) for robot, each in settings.items()}
     arms = tuple(models[robot] for robot in robots)
     _require_apart(names, bases, arms)
-    grid = manipulation_grid(arms, config, bases)
+    grid = manipulation_grid(arms, config, bases, [settings[robot].pick_height_mm for robot in robots])
     fits = {}
-    for robot in models:
+    for robot in settings:
         alike = [index for index, each in enumerate(robots) if each == robot]
         fits[robot] = fit_annulus(grid, config.fit_rounding_mm, arms=alike)
     listed = []
     for name, base, robot, mirror in zip(names, bases, robots, mirrors, strict=True):
-        fit = fits[robot]
-        listed.append(Arm(name, base, fit.r_min_mm, fit.r_max_mm, (fit.yaw_lower_rad, fit.yaw_upper_rad), robot, mirror))
-    return CellModel(Cell(tuple(listed), config), arms, grid, tuple(fits[robot] for robot in robots))
+        fit, height_mm = fits[robot], settings[robot].pick_height_mm
+        yaw = fit.yaw_lower_rad, fit.yaw_upper_rad
+        listed.append(Arm(name, base, fit.r_min_mm, fit.r_max_mm, yaw, robot, mirror, height_mm))
+    each = tuple(fits[robot] for robot in robots), tuple(settings[robot] for robot in robots)
+    return CellModel(Cell(tuple(listed), config), arms, grid, *each)
 
 
 def _standing(config: CellConfig) -> tuple[tuple[str, ...], tuple[SE2, ...], tuple[str, ...], tuple[int, ...]]:
     """Name, base, robot and mirror of each arm."""
     if not config.arms:
-        return ("left", "right"), mirrored_pair(config.base_distance_mm), (config.urdf, config.urdf), (-1, 1)
+        return ("left", "right"), mirrored_pair(config.base_distance_mm), (config.robot, config.robot), (-1, 1)
     names = tuple(arm.name for arm in config.arms)
     for index, name in enumerate(names):
         if not name or name in names[:index]:
@@ -95,12 +89,17 @@ def _standing(config: CellConfig) -> tuple[tuple[str, ...], tuple[SE2, ...], tup
     if len(names) < 2:
         raise InvalidSetting("cell.arms", len(names), "two arms at least; without any: a mirrored pair")
     bases = tuple(SE2.facing_deg(arm.x_mm, arm.y_mm, arm.facing_deg) for arm in config.arms)
-    return names, bases, tuple(arm.robot or config.urdf for arm in config.arms), (1,) * len(names)
+    return names, bases, tuple(arm.robot or config.robot for arm in config.arms), (1,) * len(names)
 
 
-def _robot(config: CellConfig, robot: str) -> ClosedFormArm:
-    limits = config.joint_limits_deg if robot == config.urdf else {}
-    return ClosedFormArm(read_urdf(urdf_path(robot), config.grasp_link), limits)
+def robot_of(config: CellConfig, robot: str) -> RobotConfig:
+    """Settings of one of the cell's robots: its own, and over them what the cell says for all arms."""
+    own = robot_config(robot)
+    said = {name: value for name in ("pick_height_mm", "pitch_deg", "shapes") if (value := getattr(config, name)) is not None}
+    limits = {**own.joint_limits_deg, **config.joint_limits_deg}
+    changed = replace(own, tip=config.grasp_link or own.tip, joint_limits_deg=limits, **said)
+    changed.validate()
+    return changed
 
 
 def _require_apart(names: Sequence[str], bases: Sequence[SE2], arms: Sequence[ClosedFormArm]) -> None:

@@ -19,7 +19,7 @@ from marl_handover.cell.chart import Chart
 from marl_handover.cell.shared_space import HandoverGraph, SharedSpace
 from marl_handover.cell.symmetry import ARM_LETTERS, Symmetry, symmetries
 from marl_handover.config import CellConfig
-from marl_handover.errors import TwoArmsOnly, UnconnectedArms, UnequalArms
+from marl_handover.errors import InvalidSetting, TwoArmsOnly, UnconnectedArms, UnequalArms
 from marl_handover.geometry.se2 import SE2
 
 
@@ -82,6 +82,19 @@ class Cell:
         return low, high
 
     @cached_property
+    def pick_heights_mm(self) -> tuple[float, ...]:
+        """How high over the table each arm's grip is where it picks and places: what the cell says, or the arm's own."""
+        asked = self.config.pick_height_mm
+        return tuple(float(arm.pick_height_mm if asked is None else asked) for arm in self.arms)
+
+    @property
+    def pick_height_mm(self) -> float:
+        """The pick height that all arms have; else raises :class:`UnequalArms`."""
+        if len(set(self.pick_heights_mm)) > 1:
+            raise UnequalArms("pick_height_mm", dict(zip(self.names, self.pick_heights_mm, strict=True)))
+        return self.pick_heights_mm[0]
+
+    @cached_property
     def extent_mm(self) -> tuple[float, float]:
         """How far from the origin, along x and along y, any arm reaches at most."""
         along_x = max(abs(arm.base.x_mm) + arm.r_max_mm for arm in self.arms)
@@ -118,6 +131,18 @@ class Cell:
         """Raise :class:`TwoArmsOnly` unless the cell has two arms; ``what`` needs them."""
         if self.num_arms != 2:
             raise TwoArmsOnly(what, self.names)
+
+    def require_grip(self, finger_travel_mm: float) -> None:
+        """Raise :class:`InvalidSetting` if hands that open so far cannot close on the pin; for whatever carries the block."""
+        block = self.config.block
+        low, high = block.height_mm, block.pin_top_mm
+        for height in self.pick_heights_mm:
+            if not low < height < high:
+                limit = f"between cell.block.height_mm = {low:g} and cell.block.pin_top_mm = {high:g}: the hand closes on the pin"
+                raise InvalidSetting("cell.pick_height_mm", height, limit)
+        if block.pin_diameter_mm >= 2 * finger_travel_mm:
+            limit = f"above {block.pin_diameter_mm / 2:g}, half of cell.block.pin_diameter_mm: fingers have to pass the pin"
+            raise InvalidSetting("motion.finger_travel_mm", finger_travel_mm, limit)
 
     def with_inset(self, chart_inset: float) -> Cell:
         """The same cell with another part of the chart in use."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from marl_handover.config import CellConfig, check_bounds, require_at_least
+from marl_handover.config import CellConfig, RobotConfig, check_bounds, require_at_least
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
@@ -27,14 +27,14 @@ class ManipulationGrid:
     """World points on the table and who can reach them.
 
     ``x_mm`` (nx,) and ``y_mm`` (ny,) are multiples of the grid step; ``masks`` (num_arms, nx, ny) is True where that arm can pick and
-    place. All arrays are read-only.
+    place, its grip ``pick_heights_mm`` (num_arms) over it. All arrays are read-only.
     """
 
     x_mm: Floats
     y_mm: Floats
     masks: Bools
     bases: tuple[SE2, ...]
-    pick_height_mm: float
+    pick_heights_mm: tuple[float, ...]
 
     def points_base_mm(self, arm_index: int) -> Floats:
         """The grid points (nx, ny, 2) in the base frame of one arm."""
@@ -74,8 +74,12 @@ def feasible(arm: ArmModel, points_base_mm: ArrayLike, pick_height_mm: float) ->
     return np.asarray(good.any(axis=-1))
 
 
-def manipulation_grid(arms: Sequence[ArmModel], cell: CellConfig, bases: Sequence[SE2]) -> ManipulationGrid:
+def manipulation_grid(
+    arms: Sequence[ArmModel], cell: CellConfig, bases: Sequence[SE2], pick_heights_mm: Sequence[float] | None = None
+) -> ManipulationGrid:
     """The grid of world points that covers the reach of ``arms``, each standing on its base.
+
+    ``pick_heights_mm`` (num_arms); None: the cell's, or what robots usually have.
 
     Raises :class:`InvalidSetting` if ``grid_mm`` is not above 0 or ``pick_height_mm`` is not a finite number of at least 0.
     """
@@ -87,10 +91,12 @@ def manipulation_grid(arms: Sequence[ArmModel], cell: CellConfig, bases: Sequenc
         high = math.ceil(max(base.position_mm[axis] + arm.reach_mm for arm, base in zip(arms, bases, strict=True)) / cell.grid_mm)
         axes.append(cell.grid_mm * np.arange(low, high + 1, dtype=np.float64))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    masks = np.stack([feasible(arm, base.to_local(points), cell.pick_height_mm) for arm, base in zip(arms, bases, strict=True)])
+    usual = RobotConfig.pick_height_mm if cell.pick_height_mm is None else cell.pick_height_mm
+    heights = tuple(float(height) for height in pick_heights_mm or [usual] * len(arms))
+    masks = np.stack([feasible(arm, base.to_local(points), height) for arm, base, height in zip(arms, bases, heights, strict=True)])
     for array in (*axes, masks):
         array.setflags(write=False)
-    return ManipulationGrid(axes[0], axes[1], masks, tuple(bases), float(cell.pick_height_mm))
+    return ManipulationGrid(axes[0], axes[1], masks, tuple(bases), heights)
 
 
 def _require_moderate(arms: Sequence[ArmModel], cell: CellConfig, bases: Sequence[SE2]) -> None:
@@ -117,7 +123,7 @@ def fit_annulus(grid: ManipulationGrid, rounding_mm: float = 0.0, weight: float 
     good = grid.masks[chosen].reshape(-1)
     if not good.any():
         limit = "a height at which the arm, its gripper level, reaches part of the table; here it reaches no grid point"
-        raise InvalidSetting("pick_height_mm", grid.pick_height_mm, limit)
+        raise InvalidSetting("pick_height_mm", grid.pick_heights_mm[chosen[0]], limit)
     radius, yaw = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
     score = np.where(good, 1.0, -weight)
     yaws = (float(yaw[good].min()), float(yaw[good].max()))

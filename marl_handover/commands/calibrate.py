@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from marl_handover.cell import build_cell
-from marl_handover.config import CellConfig, MotionConfig, bounded, check_bounds, chosen, seed_field
+from marl_handover.config import CELL_ALIASES, CellConfig, MotionConfig, bounded, check_bounds, chosen, seed_field
 from marl_handover.control.settings import WorkcellConfig
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.settings import ARMS
@@ -49,7 +49,7 @@ class CalibrateCommand(WorkcellConfig):
 
 
 SCHEMA: type = CalibrateCommand
-ALIASES: dict[str, str] = {}
+ALIASES = CELL_ALIASES
 GROUPS: dict[str, dict[str, type]] = {}
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from marl_handover.config import path_field
+from marl_handover.config import CELL_ALIASES, path_field
 from marl_handover.control.evaluation import AssessmentConfig, assess
 from marl_handover.errors import InvalidSetting, MissingFile, counted
 from marl_handover.files import write_whole
@@ -27,7 +27,7 @@ class EvaluateCommand(AssessmentConfig):
 
 
 SCHEMA = EvaluateCommand
-ALIASES = {key: f"task.{key}" for key in ("epsilon_deg", "architecture", "max_steps")}
+ALIASES = CELL_ALIASES | {key: f"task.{key}" for key in ("epsilon_deg", "architecture", "max_steps")}
 GROUPS: dict[str, dict[str, type]] = {}
 
 

@@ -14,6 +14,7 @@ from marl_handover.cell import NO_ARM
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import (
     ARCHITECTURES,
+    CELL_ALIASES,
     EPSILON_DEG,
     POSE,
     SYMMETRY_ORDER,
@@ -62,7 +63,7 @@ class PlanConfig:
 
 
 SCHEMA: type = PlanConfig
-ALIASES: dict[str, str] = {}
+ALIASES = CELL_ALIASES
 GROUPS: dict[str, dict[str, type]] = {}
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from marl_handover.config import SYMMETRY_ORDER, CellConfig, MotionConfig, bounded, check_bounds, chosen, path_field
+from marl_handover.config import CELL_ALIASES, SYMMETRY_ORDER, CellConfig, MotionConfig, bounded, check_bounds, chosen, path_field
 from marl_handover.errors import CorruptFile, InvalidSetting, UnknownChoice
 from marl_handover.files import expanded
 
@@ -37,7 +37,7 @@ class PlotConfig:
 
 
 SCHEMA: type = PlotConfig
-ALIASES: dict[str, str] = {}
+ALIASES = CELL_ALIASES
 GROUPS: dict[str, dict[str, type]] = {}
 
 

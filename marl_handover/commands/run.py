@@ -12,7 +12,18 @@ import numpy as np
 
 from marl_handover import policies
 from marl_handover.arrays import Floats
-from marl_handover.config import POSE, CellConfig, LoopConfig, MotionConfig, TaskChanges, bounded, check_bounds, path_field, seed_field
+from marl_handover.config import (
+    CELL_ALIASES,
+    POSE,
+    CellConfig,
+    LoopConfig,
+    MotionConfig,
+    TaskChanges,
+    bounded,
+    check_bounds,
+    path_field,
+    seed_field,
+)
 from marl_handover.control.settings import WorkcellConfig
 from marl_handover.errors import InvalidSetting, MissingFile, OutOfReach, counted
 
@@ -47,7 +58,7 @@ class RunCommand(WorkcellConfig):
 
 
 SCHEMA: type = RunCommand
-ALIASES = {key: f"task.{key}" for key in ("epsilon_deg", "architecture", "max_steps")}
+ALIASES = CELL_ALIASES | {key: f"task.{key}" for key in ("epsilon_deg", "architecture", "max_steps")}
 GROUPS: dict[str, dict[str, type]] = {}
 
 

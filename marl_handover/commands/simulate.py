@@ -15,7 +15,18 @@ from marl_handover import policies
 from marl_handover.arrays import Floats, wrap
 from marl_handover.cell import Cell, build_cell
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.config import POSE, CellConfig, MotionConfig, TaskChanges, bounded, check_bounds, chosen, path_field, seed_field
+from marl_handover.config import (
+    CELL_ALIASES,
+    POSE,
+    CellConfig,
+    MotionConfig,
+    TaskChanges,
+    bounded,
+    check_bounds,
+    chosen,
+    path_field,
+    seed_field,
+)
 from marl_handover.errors import InvalidSetting, OutOfReach, WorkFailed, counted
 from marl_handover.policies.policy import NobodyMoves
 from marl_handover.progress import Bar
@@ -52,7 +63,7 @@ class SimulateCommand:
 
 
 SCHEMA = SimulateCommand
-ALIASES = {key: f"task.{key}" for key in ("epsilon_deg", "architecture", "max_steps")}
+ALIASES = CELL_ALIASES | {key: f"task.{key}" for key in ("epsilon_deg", "architecture", "max_steps")}
 GROUPS: dict[str, dict[str, type]] = {}
 
 

@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from marl_handover.config import CELL_ALIASES
 from marl_handover.errors import CheckpointMismatch, InvalidSetting, MissingFile
 from marl_handover.files import read_bounded
 from marl_handover.learning.settings import ALGORITHMS, TrainConfig
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from marl_handover.learning.trainer import Trainer
 
 SCHEMA = TrainConfig
-ALIASES = {"architecture": "task.architecture"}
+ALIASES = CELL_ALIASES | {"architecture": "task.architecture"}
 GROUPS = {"algorithm": ALGORITHMS}
 FREE_ON_RESUME = ("resume", "out", "progress")
 

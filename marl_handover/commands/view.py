@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from marl_handover.config import (
+    CELL_ALIASES,
     CellConfig,
     MotionConfig,
     TaskChanges,
@@ -65,7 +66,7 @@ class ViewCommand:
 
 
 SCHEMA: type = ViewCommand
-ALIASES = {key: f"task.{key}" for key in ("epsilon_deg", "architecture", "max_steps")}
+ALIASES = CELL_ALIASES | {key: f"task.{key}" for key in ("epsilon_deg", "architecture", "max_steps")}
 GROUPS: dict[str, dict[str, type]] = {}
 
 

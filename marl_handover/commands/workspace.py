@@ -11,7 +11,7 @@ import numpy as np
 
 from marl_handover.cell import CellModel, build_cell
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.config import CellConfig, path_field
+from marl_handover.config import CELL_ALIASES, CellConfig, path_field
 
 FILE, PICTURE = "workspace.json", "workspace.png"
 
@@ -25,7 +25,7 @@ class WorkspaceConfig:
 
 
 SCHEMA: type = WorkspaceConfig
-ALIASES: dict[str, str] = {}
+ALIASES = CELL_ALIASES
 GROUPS: dict[str, dict[str, type]] = {}
 
 
@@ -57,7 +57,7 @@ def workspace_summary(model: CellModel) -> dict[str, Any]:
         "x_max_mm": cell.chart.x_max_mm,
         "y_max_at_0_mm": float(cell.chart.y_max_mm(np.float64(0.0))),
         "chart_inset": cell.chart.inset,
-        "pick_height_mm": cell.config.pick_height_mm,
+        "pick_height_mm": cell.pick_height_mm,
         "bases": {letter: [base.x_mm, base.y_mm] for letter, base in zip(ARM_LETTERS, cell.bases, strict=True)},
         "grid_mm": cell.config.grid_mm,
         "grid_points": {**points, "both": int(masks.all(0).sum())},

@@ -116,7 +116,7 @@ class CycleCheck:
         x, y, z = self.grip_mm(arm, joints_rad)
         pitch, roll = joints_rad[1] + joints_rad[2] + joints_rad[3], joints_rad[4]
         across = 0.0 if place_mm is None else math.hypot(x - place_mm[0], y - place_mm[1])
-        distance = math.hypot(across, z - self.model.cell.config.pick_height_mm)
+        distance = math.hypot(across, z - self.model.cell.pick_height_mm)
         return distance <= END_TOLERANCE_MM and max(abs(pitch), abs(roll)) <= LEVEL_TOLERANCE_RAD
 
 

@@ -26,12 +26,14 @@ class ArmModel(Protocol):
         description: the URDF's tree.
         lower_rad, upper_rad: joint limits (joints,).
         reach_mm: a bound on the grip's distance from the base frame's z axis.
+        lateral_mm: how far the grip is to the left of the vertical plane through the yaw axis in which the arm moves.
     """
 
     description: ArmDescription
     lower_rad: Floats
     upper_rad: Floats
     reach_mm: float
+    lateral_mm: float
 
     def fk(self, q: ArrayLike) -> Floats:
         """Grasp frames T_base_grip (..., 4, 4)."""
@@ -46,7 +48,7 @@ class ArmModel(Protocol):
         ...
 
     def link_transforms(self, q: ArrayLike, gripper_mm: float | None = None) -> dict[str, Floats]:
-        """Link name -> T_base_link (..., 4, 4); ``gripper_mm``: how far each finger is from its lower stop, None: fully open."""
+        """Link name -> T_base_link (..., 4, 4); ``gripper_mm``: how far each pad is from closed, None: fully open."""
         ...
 
     def ik(self, position_mm: ArrayLike, pitch_rad: ArrayLike = 0.0, roll_rad: ArrayLike = 0.0) -> Floats:

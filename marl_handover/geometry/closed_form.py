@@ -36,8 +36,10 @@ class ClosedFormArm:
     Public attributes, arrays read-only: ``description``; ``lower_rad`` and ``upper_rad`` (5,); ``shoulder_mm`` (2,), the shoulder axis in
     the arm's vertical plane (forward of the yaw axis, up from the table); ``upper_arm_mm``, ``forearm_mm`` and ``tool_mm`` (2,), the
     vectors shoulder-elbow, elbow-wrist and wrist-grip at zero; ``planar`` (8,), all four after each other; ``reach_mm``, a bound on the
-    grip's distance from the yaw axis.
+    grip's distance from the yaw axis; ``lateral_mm``, how far the grip is to the left of the plane through the yaw axis.
     """
+
+    lateral_mm = 0.0
 
     def __init__(self, description: ArmDescription, limits_deg: Mapping[str, Sequence[float]] | None = None) -> None:
         """Build the model; ``limits_deg`` (joint -> [lower, upper] in degrees) replaces the URDF's own limits.
@@ -87,7 +89,7 @@ class ClosedFormArm:
     def link_transforms(self, q: ArrayLike, gripper_mm: float | None = None) -> dict[str, Floats]:
         """Link name -> T_base_link (..., 4, 4) in mm, for joint vectors ``q`` (..., 5) in rad.
 
-        ``gripper_mm`` is how far each finger is moved from its lower stop; None means fully open, the widest the hand can be.
+        ``gripper_mm`` is how far each pad is from where it is when the hand is closed; None means fully open, the widest the hand can be.
         """
         q = np.asarray(q, dtype=float)
         frames = {self.description.root: np.eye(4)}
@@ -131,12 +133,13 @@ class ClosedFormArm:
         T = T_base_parent @ self._origins[joint.name]
         if joint.kind == "fixed":
             return T
+        if joint.name in ARM_JOINTS:
+            value = q[..., ARM_JOINTS.index(joint.name)]
+        else:  # what is no part of the gripper stays at its lower stop
+            value = np.asarray(self.description.gripper.joint_values(gripper_mm).get(joint.name, joint.lower))
         if joint.kind == "prismatic":
-            travel = joint.upper if gripper_mm is None else min(joint.lower + gripper_mm, joint.upper)
-            return np.asarray(T @ transform([travel * component for component in joint.axis], (0.0, 0.0, 0.0)))
-        # A hinged finger is taken at its lower stop.
-        angle = q[..., ARM_JOINTS.index(joint.name)] if joint.name in ARM_JOINTS else np.asarray(joint.lower)
-        R_joint = rotation(angle, joint.axis)
+            return np.asarray(T @ transform([float(value) * component for component in joint.axis], (0.0, 0.0, 0.0)))
+        R_joint = rotation(value, joint.axis)
         out = np.broadcast_to(T, np.broadcast_shapes(T.shape, (*R_joint.shape[:-2], 4, 4))).copy()
         out[..., :3, :3] = T[..., :3, :3] @ R_joint
         return out

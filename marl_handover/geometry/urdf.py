@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -44,11 +45,42 @@ class Primitive:
 
 
 @dataclass(frozen=True)
+class Mesh:
+    """A shape in a file of its own, in its link's frame; the file need not be there. ``scale``: of its units to metres."""
+
+    path: Path
+    scale: Vector
+    xyz_mm: Vector
+    rpy_rad: Vector
+
+
+@dataclass(frozen=True)
+class Visual:
+    """What a link looks like. ``rgba``: 0 to 1 each; None where the file does not say."""
+
+    shape: Primitive | Mesh
+    rgba: tuple[float, float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """Mass [kg], centre of mass, and the moments ixx, ixy, ixz, iyy, iyz, izz [kg m^2] about it in the frame that ``rpy_rad`` turns."""
+
+    mass_kg: float
+    xyz_mm: Vector
+    rpy_rad: Vector
+    inertia_kg_m2: tuple[float, float, float, float, float, float]
+
+
+@dataclass(frozen=True)
 class Link:
-    """A rigid link with its collision shapes."""
+    """A rigid link: its collision shapes, those that are meshes apart, what it looks like and what it weighs."""
 
     name: str
-    collisions: tuple[Primitive, ...]
+    collisions: tuple[Primitive, ...] = ()
+    meshes: tuple[Mesh, ...] = ()
+    visuals: tuple[Visual, ...] = ()
+    inertial: Inertial | None = None
 
 
 @dataclass(frozen=True)
@@ -72,8 +104,59 @@ class Joint:
 
 
 @dataclass(frozen=True)
+class Gripper:
+    """How a hand opens.
+
+    Attributes:
+        kind: ``fingers``, which slide; ``jaw``, one that is hinged opposite a fixed one; ``none``: things stick to the grip.
+        joints: its joints in the URDF.
+        closed: where each of them is when the hand is closed, mm or rad.
+        opening: 1 where a joint's value grows as the hand opens, else -1.
+        lever_mm: of a jaw, from its hinge to its pad.
+        travel_mm: how far each pad can be from where it is when the hand is closed.
+    """
+
+    kind: str = "none"
+    joints: tuple[str, ...] = ()
+    closed: tuple[float, ...] = ()
+    opening: tuple[int, ...] = ()
+    lever_mm: float = 0.0
+    travel_mm: float = 0.0
+
+    def joint_values(self, gripper_mm: float | None) -> dict[str, float]:
+        """Joint -> value, mm or rad, with each pad ``gripper_mm`` from where it is when the hand is closed; None: fully open.
+
+        The one pad of a jaw moves twice as far, along the chord of its way.
+        """
+        pad_mm = self.travel_mm if gripper_mm is None else min(gripper_mm, self.travel_mm)
+        moved = pad_mm if self.kind == "fingers" else 2 * math.asin(min(max(pad_mm / self.lever_mm, -1.0), 1.0)) if self.joints else 0.0
+        return {name: at + sign * moved for name, at, sign in zip(self.joints, self.closed, self.opening, strict=True)}
+
+    def gripper_mm(self, values: Sequence[float]) -> float:
+        """How far each pad is from where it is when the hand is closed, on average, for values of the :attr:`joints`."""
+        moved = [sign * (value - at) for value, at, sign in zip(values, self.closed, self.opening, strict=True)]
+        if self.kind == "fingers":
+            return sum(moved) / len(moved)
+        return self.lever_mm * math.sin(moved[0] / 2) if moved else 0.0
+
+
+@dataclass(frozen=True)
+class JointSource:
+    """The joint of the URDF that plays a role: its value is ``sign * q + offset_rad``. ``joint`` None: the arm has none, and q is 0."""
+
+    joint: str | None
+    sign: int = 1
+    offset_rad: float = 0.0
+
+
+@dataclass(frozen=True)
 class ArmDescription:
-    """One arm as its URDF describes it. ``joints`` are sorted: each comes after the one that carries its parent link."""
+    """One arm. ``joints`` are sorted: each comes after the one that carries its parent link.
+
+    Attributes:
+        sources: of each of :data:`ARM_JOINTS`, the URDF's joint.
+        assumed: what the file does not say, and was taken to be so; in words.
+    """
 
     path: Path
     name: str
@@ -81,6 +164,9 @@ class ArmDescription:
     grasp_link: str
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
+    gripper: Gripper = Gripper()
+    sources: tuple[JointSource, ...] = tuple(JointSource(name) for name in ARM_JOINTS)
+    assumed: tuple[str, ...] = ()
 
     def joint(self, name: str) -> Joint:
         """The joint of this name. Raises :class:`UrdfError` if there is none."""
@@ -118,11 +204,20 @@ def read_urdf(path: Path | str, grasp_link: str = "grip") -> ArmDescription:
         raise UrdfError(path, f"link {grasp_link!r}, the grasp frame, is missing; it has: {', '.join(names)}; set grasp_link")
     _check_order(path, joints)
     root, joints = _sort_tree(path, names, joints)
-    arm = ArmDescription(path, robot.get("name", path.stem), root, grasp_link, links, joints)
+    arm = ArmDescription(path, robot.get("name", path.stem), root, grasp_link, links, joints, _fingers(joints))
     moving = tuple(joint.name for joint in arm.chain() if joint.kind != "fixed")
     if moving != ARM_JOINTS:
         _fail(path, f"the joints from {root!r} to {grasp_link!r} are {', '.join(moving) or 'none'}; they must be {', '.join(ARM_JOINTS)}")
     return arm
+
+
+def _fingers(joints: tuple[Joint, ...]) -> Gripper:
+    sliding = [joint for joint in joints if joint.kind == "prismatic"]
+    if not sliding:
+        return Gripper()
+    travel = min(joint.upper - joint.lower for joint in sliding)
+    names, closed = tuple(joint.name for joint in sliding), tuple(joint.lower for joint in sliding)
+    return Gripper("fingers", names, closed, (1,) * len(names), 0.0, travel)
 
 
 def _fail(path: Path, problem: str) -> NoReturn:

@@ -87,7 +87,7 @@ def still(joints_rad: ArrayLike) -> Floats:
 
 def _block_rows(model: CellModel, grip_mm: Floats) -> list[list[float]]:
     """The held block and its pin, in the frame of the last joint, in which the grip is at ``grip_mm`` (3,)."""
-    block, drop = model.cell.config.block, model.cell.config.pick_height_mm
+    block, drop = model.cell.config.block, model.cell.pick_height_mm
     rows = []
     for shape in block_capsules(block, drop):
         kind = ANYWHERE if shape.link == "pin" else STANDING

@@ -62,7 +62,7 @@ class ArmConnection:
         config.validate()
         config.require_grip(model.cell.config.block.pin_diameter_mm)
         self.config, self.model, self.motion = config, model, motion or MotionConfig()
-        model.cell.config.require_grip(self.motion.finger_travel_mm)
+        model.cell.require_grip(self.motion.finger_travel_mm)
         self.clock: Clock = clock or RealClock()
         self.latch = latch or StopLatch(config.stop_path())
         self.dry_run, self.state = dry_run, State.DISCONNECTED

@@ -341,7 +341,7 @@ class MotionNumbers:
         body = arm_collision_model(model, motion)
         self.settings, self.motion = settings, motion
         self.planar = model.arm.planar
-        self.pick_height_mm = float(model.cell.config.pick_height_mm)
+        self.pick_height_mm = float(model.cell.pick_height_mm)
         self.count = JOINTS * (settings.control_points - 2)
         self.limits = torch.tensor(body.limits, dtype=torch.float32)
         B, tau = np.array(sampled_basis(SAMPLES, settings.control_points, settings.degree)), np.linspace(0.0, 1.0, SAMPLES)

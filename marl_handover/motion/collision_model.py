@@ -103,7 +103,7 @@ def arm_collision_model(model: CellModel, motion: MotionConfig) -> CollisionMode
     capsules = shaped[order]
     pairs = np.array(sorted((rank[i], rank[j]) for i, j in zip(first, second, strict=True)), np.int64).reshape(-1, 2)
     tool = arm.tool_mm
-    grip_to_table = model.cell.config.pick_height_mm
+    grip_to_table = model.cell.pick_height_mm
     block = [
         [4.0, *_shifted(shape.start_mm, tool), *_shifted(shape.end_mm, tool), shape.radius_mm]
         for shape in block_capsules(model.cell.config.block, grip_to_table)
@@ -173,7 +173,7 @@ def standing_arm(
 
 def standing_block(model: CellModel, motion: MotionConfig, place_mm: Floats) -> Floats:
     """Obstacle rows of the block standing at ``place_mm`` (2,) of the moving arm's base frame."""
-    height = model.cell.config.pick_height_mm
+    height = model.cell.pick_height_mm
     at = np.array([place_mm[0], place_mm[1], height])
     shapes = block_capsules(model.cell.config.block, height)
     rows = [[*(at + shape.start_mm), *(at + shape.end_mm), shape.radius_mm, motion.block_clearance_mm] for shape in shapes]

@@ -15,20 +15,20 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from marl_handover.arrays import Array, namespace, select, wrap
 from marl_handover.cell import Cell, build_cell
 from marl_handover.cell.arm import REACH_TOLERANCE_MM
-from marl_handover.cell.build import urdf_path
-from marl_handover.compose import to_yaml
-from marl_handover.config import MotionConfig, TaskConfig
+from marl_handover.cell.build import robot_of
+from marl_handover.config import CellConfig, MotionConfig, RobotConfig, TaskConfig
 from marl_handover.errors import CannotWrite, CorruptFile, HandoverError, MissingFile
 from marl_handover.files import MEGABYTE, cache_folder, package_path, read_arrays, writing
 from marl_handover.progress import Bar
@@ -38,6 +38,8 @@ Floats = NDArray[np.float64]
 
 LARGEST_BYTES = 64 * MEGABYTE
 SHIPPED = "pretrained/motion_cost.npz"
+ROBOT_SETTINGS = ("pitch_deg", "joints", "locked", "approach", "shapes", "parked_deg")
+"""Of a robot, that lengths depend on, besides its tip, limits and pick height."""
 RADII, YAWS, DISTANCES = 9, 25, 257
 """Nodes of the table along both radii, along the yaw between the places, and of the string along the distance."""
 
@@ -164,11 +166,21 @@ def settings_key(cell: Cell, motion: MotionConfig) -> str:
     older = {"num_initial_guesses": "starts"}  # keys of tables that are kept were made with this name
     settings = sorted((older.get(name, name), value) for name, value in asdict(motion).items() if name not in untimed)
     cell.require_pair("a table of path lengths")
-    # A pair says nothing of its arms one by one; keys from before cells could list their arms stay valid.
-    shape = to_yaml(replace(cell.config, name="", urdf="", chart_inset=1.0)).replace("arms: []\n", "")
+    robot = robot_of(cell.config, cell.config.robot)
+    shape = _shape(cell.config, robot)
     digest = hashlib.sha256(repr((RADII, YAWS, DISTANCES, shape, settings)).encode())
-    digest.update(urdf_path(cell.config.urdf).read_bytes())
+    digest.update(Path(robot.urdf).read_bytes())
     return digest.hexdigest()[:16]
+
+
+def _shape(config: CellConfig, robot: RobotConfig) -> str:
+    """What the lengths depend on of a pair and its robot, written as it was when cells had no robots: keys of kept tables stay valid."""
+    usual = RobotConfig()
+    told = {"name": "", "urdf": "", "grasp_link": robot.tip, "base_distance_mm": config.base_distance_mm}
+    told |= {"pick_height_mm": robot.pick_height_mm, "joint_limits_deg": robot.joint_limits_deg}
+    told |= {name: getattr(config, name) for name in ("grid_mm", "fit_rounding_mm")} | {"chart_inset": 1.0, "block": asdict(config.block)}
+    told |= {name: value for name in ROBOT_SETTINGS if (value := getattr(robot, name)) != getattr(usual, name)}
+    return yaml.safe_dump(told, sort_keys=False)
 
 
 def read_table(path: Path, key: str) -> PathLengthTable:

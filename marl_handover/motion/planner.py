@@ -47,14 +47,14 @@ class MotionPlanner:
     def __init__(self, model: CellModel, motion: MotionConfig | None = None) -> None:
         self.model, self.motion = model, motion or MotionConfig()
         self.motion.validate()
-        model.cell.config.require_grip(self.motion.finger_travel_mm)
+        model.cell.require_grip(self.motion.finger_travel_mm)
         self.home_rad = np.radians(np.asarray(self.motion.parked_deg, float))
         if not model.arm.within_limits(self.home_rad):
             raise InvalidSetting("motion.parked_deg", self.motion.parked_deg, "angles within the joint limits")
         self.collision_model = arm_collision_model(model, self.motion)
         self.clearance_mm = np.array([self.motion.self_clearance_mm, self.motion.ground_clearance_mm])
         self._standing: tuple[tuple[int, bytes], Floats] = ((-1, b""), np.zeros((0, 9)))  # the last one asked for
-        self.pick_height_mm = float(model.cell.config.pick_height_mm)
+        self.pick_height_mm = float(model.cell.pick_height_mm)
 
     def pick_place(
         self, arm: int, pick_mm: ArrayLike, place_mm: ArrayLike, joints_rad: ArrayLike, other_joints_rad: ArrayLike
@@ -246,7 +246,7 @@ def grasp_joints(model: CellModel, arm: int, what: str, position_mm: Floats) -> 
     """
     base, arm_model = model.cell.bases[arm], model.arm
     x, y = base.to_local(position_mm)
-    q = arm_model.ik(np.array([x, y, model.cell.config.pick_height_mm]))
+    q = arm_model.ik(np.array([x, y, model.cell.pick_height_mm]))
     inside = np.clip(q, arm_model.lower_rad, arm_model.upper_rad)
     good = (np.abs(q - inside) <= EDGE_RAD).all(axis=-1)  # NaN, out of reach, is not
     if not good.any():

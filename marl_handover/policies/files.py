@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.compose import from_mapping
 from marl_handover.config import CellConfig, NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.errors import CorruptFile
 from marl_handover.files import read_arrays
@@ -37,11 +38,9 @@ Layers = list[tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 def stored_settings(about: Mapping[str, Any]) -> tuple[CellConfig, TaskConfig]:
     """The cell and the task a policy file was trained with."""
-    cell = dict(about["cell"])
-    cell["block"] = type(CellConfig().block)(**cell["block"])
     task = dict(about["task"])
     task["reward"], task["noise"] = RewardConfig(**task["reward"]), NoiseConfig(**task["noise"])
-    return CellConfig(**cell), TaskConfig(**task)
+    return from_mapping(CellConfig, about["cell"], Path("policy file")), TaskConfig(**task)
 
 
 def read_policy(path: Path) -> dict[str, NDArray[Any]]:

@@ -159,7 +159,7 @@ def _numbered(motions: Sequence[TransferMotion]) -> list[tuple[Floats, list[str]
 
 def _draw_side(axes: Axes, motions: Sequence[TransferMotion], model: CellModel) -> None:
     axes.axhline(0.0, color=INK, linewidth=1.2)
-    height = model.cell.config.pick_height_mm
+    height = model.cell.pick_height_mm
     axes.axhline(height, color=GREY, linewidth=0.7, linestyle=":")
     axes.annotate("pick height", (1.0, height), xycoords=("axes fraction", "data"), xytext=(-3, 3), textcoords="offset points", fontsize=8,
                   color=GREY, ha="right")  # fmt: skip
@@ -305,7 +305,7 @@ def _capsules(model: CellModel, settings: MotionConfig, arm: int, joints_rad: Fl
     pieces: list[tuple[Floats, Capsule]] = [(frames[capsule.link], capsule) for capsule in capsule_pairs(model.arm.description)[0]]
     if holding:
         config = model.cell.config
-        pieces += [(model.arm.fk(joints_rad), capsule) for capsule in block_capsules(config.block, config.pick_height_mm)]
+        pieces += [(model.arm.fk(joints_rad), capsule) for capsule in block_capsules(config.block, model.cell.pick_height_mm)]
     world = model.cell.bases[arm].to_world
     return [(world(apply(T, c.start_mm)), world(apply(T, c.end_mm)), c.radius_mm) for T, c in pieces]
 

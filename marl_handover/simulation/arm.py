@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marl_handover.cell.build import urdf_path
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.se2 import SE2
 from marl_handover.geometry.urdf import ARM_JOINTS
@@ -38,8 +37,7 @@ class SimulatedArm:
 
     def __init__(self, engine: Engine, model: ArmModel, base: SE2) -> None:
         self._engine = engine
-        path = urdf_path(str(model.description.path))
-        self.body = engine.load_arm(path, base.x_mm, base.y_mm, base.facing_rad)
+        self.body = engine.load_arm(model.description.path, base.x_mm, base.y_mm, base.facing_rad)
         count = pybullet.getNumJoints(self.body, physicsClientId=self._client)
         info = [pybullet.getJointInfo(self.body, link, physicsClientId=self._client) for link in range(count)]
         links = {entry[1].decode(): entry[0] for entry in info}

@@ -244,7 +244,7 @@ class BulletCell:
 
     def __init__(self, model: CellModel, motion: MotionConfig, *, grasp: str = "friction", gui: bool = False) -> None:
         require_choice("grasp", grasp, GRASPS)
-        model.cell.config.require_grip(motion.finger_travel_mm)
+        model.cell.require_grip(motion.finger_travel_mm)
         self.model, self.motion, self.grasp = model, motion, grasp
         self.home_rad = np.radians(motion.parked_deg)
         self.engine = Engine(gui)

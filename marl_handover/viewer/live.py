@@ -12,6 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,8 @@ from marl_handover.arrays import Floats
 from marl_handover.cell import CellModel, build_cell
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.config import BlockConfig, CellConfig
+from marl_handover.compose import from_mapping
+from marl_handover.config import CellConfig
 from marl_handover.control.events import FAULTS
 from marl_handover.control.remote_control import MAX_AGE_S, SessionCommand
 from marl_handover.control.telemetry_reader import Reading, TelemetryReader
@@ -422,16 +424,15 @@ def _camera_label(reading: Reading) -> str:
 def _cell_config(state: dict[str, Any]) -> CellConfig | None:
     """The session's cell; None as long as it has not said."""
     try:
-        cell = dict(state["cell"])
-        return CellConfig(**{**cell, "block": BlockConfig(**cell["block"])})
-    except (KeyError, TypeError):
+        return from_mapping(CellConfig, state["cell"], Path("session"))
+    except (KeyError, AttributeError, HandoverError):
         return None
 
 
 def _picking(cell: Cell, arm: int, pose: list[float]) -> Floats:
     """T_world_grip (4, 4) of an arm that takes the block at ``pose`` (3,): level, at the height where blocks are held."""
     yaw = float(cell.gripper_yaw(cell.polar(np.array(pose[:2], float))[1])[arm])
-    return transform((pose[0], pose[1], cell.config.pick_height_mm), (0.0, 0.0, yaw))
+    return transform((pose[0], pose[1], cell.pick_heights_mm[arm]), (0.0, 0.0, yaw))
 
 
 def _lying(T_world_block: Floats) -> Floats:

@@ -123,7 +123,7 @@ def test_a_yaw_range_too_narrow_for_the_tips_is_named():
 def test_a_missing_urdf_is_named(tmp_path):
     for urdf in ("no_such_arm.urdf", str(tmp_path / "no_such_arm.urdf")):
         with pytest.raises(MissingFile, match=r"no_such_arm\.urdf"):
-            build_cell(replace(PAPER, urdf=urdf))
+            build_cell(replace(PAPER, robot=urdf))
 
 
 def test_an_unknown_cell_lists_the_known_ones():

@@ -33,7 +33,7 @@ def base_frame(model, arm: int) -> np.ndarray:
 def held(model, arm: int, points: np.ndarray) -> np.ndarray:
     """T_world_grip (n, 4, 4) with the pin held at table points (n, 2), through the URDF's inverse and forward kinematics."""
     T_world_base = base_frame(model, arm)
-    world = np.concatenate([points, np.full((len(points), 1), model.cell.config.pick_height_mm), np.ones((len(points), 1))], -1)
+    world = np.concatenate([points, np.full((len(points), 1), model.cell.pick_height_mm), np.ones((len(points), 1))], -1)
     q = model.arm.ik((world @ np.linalg.inv(T_world_base).T)[:, :3])
     within = model.arm.within_limits(q)
     assert within.any(-1).all()

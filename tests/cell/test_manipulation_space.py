@@ -50,7 +50,7 @@ def known(low: float, high: float, yaw_low: float, yaw_high: float, holes: int =
     i, j = np.nonzero(mask)
     middle = slice(len(i) // 2, len(i) // 2 + holes)
     mask[i[middle], j[middle]] = False
-    return ManipulationGrid(axis, axis, mask[None], (base_at(0.0, 0.0, 0.0),), 45.0)
+    return ManipulationGrid(axis, axis, mask[None], (base_at(0.0, 0.0, 0.0),), (45.0,))
 
 
 def test_paper_cell_has_the_papers_annulus() -> None:

@@ -179,7 +179,7 @@ def test_arms_of_two_kinds_have_a_reach_each():
     assert reach["small"] == (150.0, 230.0)
     assert reach["large"] == reach["third"]
     assert reach["large"][1] > 300
-    with pytest.raises(UnequalArms, match="all arms must have the same robot for this; they have: small al5a.urdf, large"):
+    with pytest.raises(UnequalArms, match="all arms must have the same robot for this; they have: small al5a_paper, large"):
         _ = model.arm
     with pytest.raises(UnequalArms, match="r_max_mm"):
         _ = model.cell.r_max_mm

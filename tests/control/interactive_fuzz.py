@@ -120,8 +120,8 @@ def rates_limits(cell: InteractiveCell):
 def least_gaps_mm(cell: InteractiveCell, seen: Seen):
     """The arms' least distance from each other (n,), and the hands' from a block that nobody holds (n,), inf where a hand holds it."""
     config, arms, to_block = cell.model.cell.config, [], []
-    places = np.stack([np.append(it.block[:2], config.pick_height_mm) for it in seen.snapshots])
-    capsules = block_capsules(config.block, config.pick_height_mm)
+    places = np.stack([np.append(it.block[:2], cell.model.cell.pick_height_mm) for it in seen.snapshots])
+    capsules = block_capsules(config.block, cell.model.cell.pick_height_mm)
     joints = joints_of(seen)
     for index, base in enumerate(cell.model.cell.bases):
         frames = cell.model.arm.link_transforms(joints[:, index], cell.motion.finger_travel_mm)

@@ -37,7 +37,7 @@ def check(paths, arm, track, start, pin_mm=None):
     assert not track.velocities_rad_s[[0, -1]].any()
     assert (abs(track.velocities_rad_s) <= paths.velocity_rad_s * 1.001).all()
     grip = model.arm.fk(track.joints_rad)[:, :3, 3]
-    assert grip[:, 2].min() >= model.cell.config.pick_height_mm - 0.05
+    assert grip[:, 2].min() >= model.cell.pick_height_mm - 0.05
     if pin_mm is None:
         assert paths.parked(track.end_rad)
     else:

@@ -15,8 +15,8 @@ import pybullet
 import pytest
 
 from marl_handover.cell import cell_config, load_cell
-from marl_handover.cell.build import urdf_path
 from marl_handover.cli import main
+from marl_handover.geometry.robot import robot_config
 
 JOINTS = ("base_yaw", "shoulder", "elbow", "wrist_pitch", "wrist_roll")
 PHASES = ("approach", "grasp", "lift", "transfer", "lower", "release", "retreat")
@@ -40,13 +40,13 @@ class BulletCheck:
     def __init__(self, cell_name):
         config, cell = cell_config(cell_name), load_cell(cell_name)
         self.client = pybullet.connect(pybullet.DIRECT)
-        self.urdf = str(urdf_path(config.urdf))
+        self.urdf = robot_config(config.robot).urdf
         self.bases = {"LR"[index]: base for index, base in enumerate(cell.bases)}
         self.arms = {letter: self._arm(base) for letter, base in self.bases.items()}
         names = [pybullet.getJointInfo(self.arms["L"], joint, self.client) for joint in range(self._count())]
         self.joints = {info[1].decode(): info[0] for info in names}
         self.links = {info[12].decode(): info[0] for info in names} | {"base_link": -1}
-        self.limits = np.radians([config.joint_limits_deg[name] for name in JOINTS])
+        self.limits = np.radians([robot_config(config.robot).joint_limits_deg[name] for name in JOINTS])
         plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=self.client)
         self.table = pybullet.createMultiBody(0, plane, physicsClientId=self.client)
         halves = [SIDE_M / 2, SIDE_M / 2, HEIGHT_M / 2]

@@ -46,7 +46,7 @@ def cycle(model, arm, pick_mm, place_mm, joints=PARKED):
     ends = [joints]
     for x, y in (pick_mm, place_mm):
         dx, dy, angle = x - base.x_mm, y - base.y_mm, base.facing_rad
-        local = [math.cos(angle) * dx + math.sin(angle) * dy, math.cos(angle) * dy - math.sin(angle) * dx, model.cell.config.pick_height_mm]
+        local = [math.cos(angle) * dx + math.sin(angle) * dy, math.cos(angle) * dy - math.sin(angle) * dx, model.cell.pick_height_mm]
         ends.append(model.arm.ik(local)[0])
     ends.append(PARKED)
     return PickPlacePaths(*(np.linspace(*pair, MOTION.control_points) for pair in pairwise(ends)))

@@ -28,7 +28,7 @@ def bases(model):
 def held(model):
     """The block's and the pin's capsules, in the frame of the grip."""
     config = model.cell.config
-    return [Capsule("grip", c.start_mm, c.end_mm, c.radius_mm) for c in block_capsules(config.block, config.pick_height_mm)]
+    return [Capsule("grip", c.start_mm, c.end_mm, c.radius_mm) for c in block_capsules(config.block, model.cell.pick_height_mm)]
 
 
 def placed(model, q, base, holding=False):
@@ -43,7 +43,7 @@ def corners_mm(model, q):
     """Height of the lowest point of the rim of the disc around the held block."""
     config, turns = model.cell.config, np.linspace(0, 2 * np.pi, 721)
     radius = config.block.side_mm / math.sqrt(2)
-    rim = np.stack([radius * np.cos(turns), radius * np.sin(turns), np.full(721, -config.pick_height_mm), np.ones(721)])
+    rim = np.stack([radius * np.cos(turns), radius * np.sin(turns), np.full(721, -model.cell.pick_height_mm), np.ones(721)])
     top = rim + np.array([[0.0], [0.0], [config.block.height_mm], [0.0]])
     T = model.arm.fk(q)
     return float(min((T @ rim)[2].min(), (T @ top)[2].min()))

@@ -50,7 +50,7 @@ def test_direct_cycles_end_level_at_pin_and_place(arm, model):
         np.testing.assert_allclose([approach[0], retreat[-1]], [PARKED, PARKED], atol=1e-6)
         for joints, distance, angle in ((transfer[0], radius, yaw), (transfer[-1], other_radius, other_yaw)):
             T = model.arm.fk(joints)
-            expected = [distance * math.cos(angle), distance * math.sin(angle), cell.config.pick_height_mm]
+            expected = [distance * math.cos(angle), distance * math.sin(angle), cell.pick_height_mm]
             np.testing.assert_allclose(T[:3, 3], expected, atol=0.01)
             np.testing.assert_allclose(T[:3, :3] @ [0, 0, 1], [0, 0, 1], atol=1e-5)  # pitch = roll = 0
 

@@ -44,7 +44,7 @@ def test_the_least_clearance_is_the_planners(planner, model, motions):
 def test_the_grip_is_at_pick_and_place(model, motions):
     for motion in motions:
         phases = {phase.name: phase.joints_rad for phase in motion.phases}
-        height = model.cell.config.pick_height_mm
+        height = model.cell.pick_height_mm
         np.testing.assert_allclose(grip_mm(model, motion.arm, phases["grasp"][-1]), [*motion.from_mm, height], atol=1e-6)
         np.testing.assert_allclose(grip_mm(model, motion.arm, phases["release"][0]), [*motion.to_mm, height], atol=1e-6)
 

@@ -45,7 +45,7 @@ def cycle(model, motion, joints_at):
 
     def make(arm, pick_mm, place_mm, turn_s=1.0):
         pick_mm, place_mm = np.asarray(pick_mm, float), np.asarray(place_mm, float)
-        low = model.cell.config.pick_height_mm
+        low = model.cell.pick_height_mm
         parked, opened = np.radians(motion.parked_deg), motion.finger_travel_mm
         over = [joints_at(arm, place, low + ABOVE_MM)[0] for place in (pick_mm, place_mm)]
         down, up = (

@@ -91,7 +91,7 @@ def test_every_state_of_an_episode_can_be_shown(page, session):
 def test_the_block_in_the_hand_stays_where_it_is_held(model, page, session):
     """Carried from a place to another it turns as the rule book says."""
     rules = Rules(model.cell, TaskConfig())
-    height = model.cell.config.pick_height_mm
+    height = model.cell.pick_height_mm
     random, tried = np.random.default_rng(0), 0
     for _ in range(300):
         arm = int(random.integers(2))

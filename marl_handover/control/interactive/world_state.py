@@ -113,7 +113,7 @@ class WorldState:
         segment = self.program[0]
         if segment.kind != "carry":
             return segment.kind
-        if self.grip(self.arm)[2, 3] >= self.model.cell.config.pick_height_mm + LIFTED_MM:
+        if self.grip(self.arm)[2, 3] >= self.model.cell.pick_height_mm + LIFTED_MM:
             return "transfer"
         return "lift" if segment.track is None or self.clock_s < segment.track.duration_s / 2 else "lower"
 
