@@ -240,7 +240,7 @@ class ClosedLoop:
 
     def _plan(self, command: TransferCommand, pose: Floats, seen: Floats) -> TransferMotion:
         joints = self.backend.joints_rad()
-        own, other = self._settled(joints[command.arm]), np.delete(joints, command.arm, axis=0)
+        own, other = self._settled(command.arm, joints[command.arm]), np.delete(joints, command.arm, axis=0)
         try:
             return self.planner.plan_paths(command.arm, pose[:2], command.place_mm, own, other)
         except OutOfArmsReach:
@@ -248,9 +248,9 @@ class ClosedLoop:
                 raise
             return self.planner.plan_paths(command.arm, seen[:2], command.place_mm, own, other)
 
-    def _settled(self, joints_rad: Floats) -> Floats:
+    def _settled(self, index: int, joints_rad: Floats) -> Floats:
         """An arm's measured joints (5,) as a plan can begin with: a servo's droop past a limit or off roll 0 is taken away."""
-        arm = self.planner.model.arm
+        arm = self.planner.model.arms[index]
         wanted = np.clip(joints_rad, arm.lower_rad, arm.upper_rad)
         wanted[4] = 0.0
         return np.where(abs(wanted - joints_rad) <= ROLL_RAD, wanted, joints_rad)

@@ -161,7 +161,7 @@ class HardwareBackend:
             return Execution(before.copy(), self.joints_rad(), 0.0, refusal)
         if self.hold() and self._moved_since(before):
             return Execution(self._last.pose.copy(), self.joints_rad(), 0.0, Refusal.MISSED_GRASP)
-        phases = timed_phases(welded(paths), self.model.arm, self.motion, self.model.cell.pick_height_mm)
+        phases = timed_phases(welded(paths), self.model.arms[arm], self.motion, self.model.cell.pick_heights_mm[arm])
         place = self.check.grip_mm(arm, paths.transfer[-1])[:2]
         self.log.add(Event.MOTION, arm=arm, phases=[[phase.name, float(phase.t_s[0]), float(phase.t_s[-1])] for phase in phases])
         played = self.player.play(arm, phases, None if self.workcell.driver.dry_run else self._block_watch(before))

@@ -91,7 +91,7 @@ class Session:
         self.printed = PrintedGoal(self.backend)
         """The printed marker, of all episodes."""
         rules = loop.rules
-        parked = self.backend.check.home_rad
+        parked = self.backend.check.homes_rad[0]  # a session's arms are of one robot
         self.log.add(
             Event.SESSION,
             **about,

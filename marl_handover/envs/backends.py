@@ -92,13 +92,13 @@ class KinematicBackend:
         self.model, self.motion = model, motion
         self.check = CycleCheck(model, motion)
         self.check_collisions = _collision_check(check_collisions, model, motion)
-        self._joints = np.tile(self.check.home_rad, (model.cell.num_arms, 1))
+        self._joints = self.check.homes_rad.copy()
         self._pose = np.zeros(3)
         self._view: TopView | None = None
 
     def reset(self, pose: Floats, seed: int) -> Floats:
         """Park the arms and put the object at ``pose`` (3,): it is measured there."""
-        self._joints[:] = self.check.home_rad
+        self._joints[:] = self.check.homes_rad
         self.put(pose)
         return self._pose.copy()
 

@@ -44,7 +44,7 @@ class CollisionFinder:
         """Whether the cycle ``paths`` of ``arm`` touches anything, all arms being at ``joints_rad`` (num_arms, 5) before it."""
         if max(float(abs(points[:, 4]).max()) for points in paths) > ROLL_RAD:
             return True
-        planner, other, parked = self._planner, np.delete(joints_rad, arm, 0), self._planner.home_rad
+        planner, other, parked = self._planner, np.delete(joints_rad, arm, 0), self._planner.homes_rad[arm]
         pick_mm, place_mm = (self._within_reach(arm, paths.transfer[end]) for end in (0, -1))
         segments = (
             planner.reaching(arm, parked, pick_mm, other, leaving=False)[0],
@@ -63,4 +63,5 @@ class CollisionFinder:
         centre = self._cell.bases[arm].position_mm
         gap = self._check.grip_mm(arm, joints_rad)[:2] - centre
         radius = float(np.hypot(*gap))
-        return np.asarray(centre + gap / radius * min(max(radius, self._cell.r_min_mm), self._cell.r_max_mm))
+        ring = self._cell.arms[arm]
+        return np.asarray(centre + gap / radius * min(max(radius, ring.r_min_mm), ring.r_max_mm))

@@ -10,7 +10,7 @@ import numpy as np
 from marl_handover.arrays import Floats
 from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig
-from marl_handover.errors import InvalidSetting
+from marl_handover.motion.home import parked_poses
 from marl_handover.motion.trajectory import PickPlacePaths, knots, sampled_basis
 
 END_TOLERANCE_MM = 1.0
@@ -61,6 +61,9 @@ class CycleCheck:
         model: the cell.
         motion: the parked pose and the splines' degree.
 
+    Attributes:
+        homes_rad: (num_arms, 5) where each arm parks.
+
     Raises:
         InvalidSetting: for a setting of ``motion`` out of its limits, or a pose the arm cannot park in.
     """
@@ -69,9 +72,7 @@ class CycleCheck:
         motion.validate()
         self.model, self.motion = model, motion
         knots(motion.control_points, motion.degree)  # refuses settings that are no spline
-        self.home_rad = np.radians(motion.parked_deg)
-        if self.home_rad.shape != model.arm.lower_rad.shape or not model.arm.within_limits(self.home_rad):
-            raise InvalidSetting("motion.parked_deg", motion.parked_deg, f"{len(model.arm.lower_rad)} angles within the arm's joint limits")
+        self.homes_rad = parked_poses(model, motion)
 
     def __call__(
         self, arm: int, paths: PickPlacePaths, joints_rad: Floats, object_mm: Floats, target_mm: Floats | None = None
@@ -88,7 +89,7 @@ class CycleCheck:
         points = np.concatenate(paths)
         if not np.isfinite(points).all():
             return Refusal.NOT_FINITE
-        if not self.model.arm.within_limits(points).all():
+        if not self.model.arms[arm].within_limits(points).all():
             return Refusal.JOINT_LIMITS
         jump = max(_apart(paths.approach[-1], paths.transfer[0]), _apart(paths.transfer[-1], paths.retreat[0]))
         if jump > JOIN_TOLERANCE_RAD or _apart(joints_rad, paths.approach[0]) > SERVO_TOLERANCE_RAD:
@@ -97,13 +98,13 @@ class CycleCheck:
             return Refusal.OBJECT_ELSEWHERE
         if not self._level_at(arm, paths.transfer[-1], target_mm):
             return Refusal.WRONG_PLACE
-        if _apart(paths.retreat[-1], self.home_rad) > JOIN_TOLERANCE_RAD:
+        if _apart(paths.retreat[-1], self.homes_rad[arm]) > JOIN_TOLERANCE_RAD:
             return Refusal.CANNOT_PARK
         return None
 
     def grip_mm(self, arm: int, joints_rad: Floats) -> Floats:
         """World position (..., 3) of an arm's grip at joints (..., 5)."""
-        return self.model.cell.bases[arm].to_world(self.model.arm.grip_mm(joints_rad))
+        return self.model.cell.bases[arm].to_world(self.model.arms[arm].grip_mm(joints_rad))
 
     def path_mm(self, arm: int, control_points: Floats) -> float:
         """Length of the grip's path along a spline (N, 5)."""
@@ -116,7 +117,7 @@ class CycleCheck:
         x, y, z = self.grip_mm(arm, joints_rad)
         pitch, roll = joints_rad[1] + joints_rad[2] + joints_rad[3], joints_rad[4]
         across = 0.0 if place_mm is None else math.hypot(x - place_mm[0], y - place_mm[1])
-        distance = math.hypot(across, z - self.model.cell.pick_height_mm)
+        distance = math.hypot(across, z - self.model.cell.pick_heights_mm[arm])
         return distance <= END_TOLERANCE_MM and max(abs(pitch), abs(roll)) <= LEVEL_TOLERANCE_RAD
 
 

@@ -230,7 +230,7 @@ class HandoverEnv(AECEnv):
         """Why it was refused or failed, the object's pose afterwards, and the length of the path."""
         if not turn.feasible:
             return Refusal.OUT_OF_REACH, self._pose, 0.0
-        paths = read_cycle(action, self.spaces.control_points, self.model.arm)
+        paths = read_cycle(action, self.spaces.control_points, self.model.arms[turn.arm])
         if isinstance(paths, Refusal):
             return paths, self._pose, 0.0
         joints = self.backend.joints_rad()[turn.arm]

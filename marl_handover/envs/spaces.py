@@ -95,15 +95,14 @@ class Spaces:
     """
 
     def __init__(self, model: CellModel, motion: MotionConfig) -> None:
-        cell, lower, upper = model.cell, model.arm.lower_rad, model.arm.upper_rad
+        cell = model.cell
         self.num_arms, self.control_points = cell.num_arms, motion.control_points
-        reach = [max(abs(base.x_mm) for base in cell.bases), max(abs(base.y_mm) for base in cell.bases)]
-        high = np.array([*(value + cell.r_max_mm + EDGE_MM for value in reach), math.pi], np.float32)
-        self._high = high
-        self._lower, self._upper = lower.astype(np.float32), upper.astype(np.float32)
+        self._high = np.array([*(value + EDGE_MM for value in cell.extent_mm), math.pi], np.float32)
+        self._lower = np.stack([arm.lower_rad for arm in model.arms]).astype(np.float32)
+        self._upper = np.stack([arm.upper_rad for arm in model.arms]).astype(np.float32)
         self.observation, self.action = {SUPERVISOR: self._supervisor_sees()}, {SUPERVISOR: self._supervisor_acts()}
-        for agent in ARM_AGENTS[: self.num_arms]:
-            self.observation[agent], self.action[agent] = self._arm_sees(), self._arm_acts()
+        for arm, agent in enumerate(ARM_AGENTS[: self.num_arms]):
+            self.observation[agent], self.action[agent] = self._arm_sees(arm), self._arm_acts(arm)
 
     def supervisor_sees(self, rules: Rules, pose: Floats, goal: Floats, previous_arm: Any) -> dict[str, Any]:
         """The supervisor's observation; ``previous_arm`` is -1 for none."""
@@ -143,18 +142,18 @@ class Spaces:
     def _supervisor_acts(self) -> Dict:
         return Dict(final=Discrete(2), arm=Discrete(self.num_arms), place=Box(-1.0, 1.0, (2,)))
 
-    def _arm_sees(self) -> Dict:
-        others = self.num_arms - 1
+    def _arm_sees(self, arm: int) -> Dict:
         return Dict(
             active=Discrete(2),
             target=Box(-self._high[:2], self._high[:2]),
             object=Box(-self._high, self._high),
-            joints=Box(self._lower, self._upper),
-            other_joints=Box(np.tile(self._lower, others), np.tile(self._upper, others)),
+            joints=Box(self._lower[arm], self._upper[arm]),
+            other_joints=Box(np.delete(self._lower, arm, 0).reshape(-1), np.delete(self._upper, arm, 0).reshape(-1)),
             final=Discrete(2),
         )
 
-    def _arm_acts(self) -> Dict:
-        shape = (3, self.control_points, len(self._lower))
-        paths = Box(np.broadcast_to(self._lower, shape), np.broadcast_to(self._upper, shape))
+    def _arm_acts(self, arm: int) -> Dict:
+        lower, upper = self._lower[arm], self._upper[arm]
+        shape = (3, self.control_points, len(lower))
+        paths = Box(np.broadcast_to(lower, shape), np.broadcast_to(upper, shape))
         return Dict(paths=paths, grasp=Discrete(2), release=Discrete(2), reason=Discrete(len(REASONS)))

@@ -2,8 +2,9 @@
 
 A joint vector is q = (base_yaw, shoulder, elbow, wrist_pitch, wrist_roll) in rad. Frames: ``base`` lies on the table under the yaw axis,
 ``grip`` is the grasp frame. Below the class: the same kinematics in the arm's own vertical plane for numpy and torch, whole batches at
-once. There a point is (r, z): forward of the yaw axis and up from the table; ``planar`` (8,) holds the shoulder's (r, z), then the
-vectors shoulder-elbow, elbow-wrist and wrist-grip at zero. For compiled loops: :mod:`marl_handover.geometry.kernels`.
+once. There a point is (r, z): forward of the yaw axis and up from the table; ``planar`` (9,) holds the shoulder's (r, z), the vectors
+shoulder-elbow, elbow-wrist and wrist-grip at zero, and how far to the left of the plane the grip is. For compiled loops:
+:mod:`marl_handover.geometry.kernels`.
 """
 
 from __future__ import annotations
@@ -35,11 +36,9 @@ class ClosedFormArm:
 
     Public attributes, arrays read-only: ``description``; ``lower_rad`` and ``upper_rad`` (5,); ``shoulder_mm`` (2,), the shoulder axis in
     the arm's vertical plane (forward of the yaw axis, up from the table); ``upper_arm_mm``, ``forearm_mm`` and ``tool_mm`` (2,), the
-    vectors shoulder-elbow, elbow-wrist and wrist-grip at zero; ``planar`` (8,), all four after each other; ``reach_mm``, a bound on the
-    grip's distance from the yaw axis; ``lateral_mm``, how far the grip is to the left of the plane through the yaw axis.
+    vectors shoulder-elbow, elbow-wrist and wrist-grip at zero; ``lateral_mm``, how far to the left of that plane the grip is at wrist roll
+    0; ``planar`` (9,), all five after each other; ``reach_mm``, a bound on the grip's distance from the yaw axis.
     """
-
-    lateral_mm = 0.0
 
     def __init__(self, description: ArmDescription, limits_deg: Mapping[str, Sequence[float]] | None = None) -> None:
         """Build the model; ``limits_deg`` (joint -> [lower, upper] in degrees) replaces the URDF's own limits.
@@ -53,10 +52,10 @@ class ClosedFormArm:
         self.lower_rad, self.upper_rad = _frozen(limits[:, 0]), _frozen(limits[:, 1])
         self.shoulder_mm = _frozen(origins[1])
         self.upper_arm_mm, self.forearm_mm = _frozen(origins[2] - origins[1]), _frozen(origins[3] - origins[2])
-        self.tool_mm = _frozen(grip_mm - origins[3])
+        self.tool_mm, self.lateral_mm = _frozen(grip_mm[[0, 2]] - origins[3]), float(grip_mm[1])
         vectors = (self.upper_arm_mm, self.forearm_mm, self.tool_mm)
-        self.planar = _frozen(np.concatenate([self.shoulder_mm, *vectors]))
-        self.reach_mm = abs(float(self.shoulder_mm[0])) + sum(math.hypot(*vector) for vector in vectors)
+        self.planar = _frozen(np.concatenate([self.shoulder_mm, *vectors, [self.lateral_mm]]))
+        self.reach_mm = math.hypot(abs(float(self.shoulder_mm[0])) + sum(math.hypot(*vector) for vector in vectors), self.lateral_mm)
         self._origins = {joint.name: transform(joint.xyz_mm, joint.rpy_rad) for joint in description.joints}
 
     def fk(self, q: ArrayLike) -> Floats:
@@ -71,7 +70,7 @@ class ClosedFormArm:
         """Grip positions (..., 3) in mm of joint vectors ``q`` (..., >= 4) in rad: those of :meth:`fk`, without its matrices."""
         q = np.asarray(q, dtype=float)
         r, z = grip_in_plane(self.planar, q)
-        return np.stack([r * np.cos(q[..., 0]), r * np.sin(q[..., 0]), z], axis=-1)
+        return np.stack([*out_of_plane(self.planar, r, q[..., 0]), z], axis=-1)
 
     def jacobian(self, q: ArrayLike) -> Floats:
         """Geometric Jacobians (..., 6, 5) of the grip in the base frame: mm/rad, then rad/rad, for joint vectors ``q`` (..., 5) in rad."""
@@ -107,10 +106,11 @@ class ClosedFormArm:
         shape = np.broadcast_shapes(position.shape[:-1], np.shape(pitch_rad), np.shape(roll_rad))
         pitch, roll = np.broadcast_to(np.asarray(pitch_rad, dtype=float), shape), np.broadcast_to(np.asarray(roll_rad, dtype=float), shape)
         x, y, z = (np.broadcast_to(position[..., axis], shape) for axis in range(3))
+        radius, yaw = into_plane(self.planar, np.hypot(x, y), np.arctan2(y, x))
         branches = []
         for elbow in (-1, 1):
-            pitches = planar_ik(self.planar, np.hypot(x, y), z, pitch, elbow)
-            branches.append(self._nearest_turn(np.concatenate([np.arctan2(y, x)[..., None], pitches, roll[..., None]], axis=-1)))
+            pitches = planar_ik(self.planar, radius, z, pitch, elbow)
+            branches.append(self._nearest_turn(np.concatenate([yaw[..., None], pitches, roll[..., None]], axis=-1)))
         return np.stack(branches, axis=-2)
 
     def within_limits(self, q: ArrayLike) -> Bools:
@@ -171,12 +171,32 @@ def grip_in_plane(planar: Array, q: Array) -> tuple[Array, Array]:
     return r + cos * x - sin * y, z + sin * x + cos * y
 
 
+def into_plane(planar: Array, distance: Array, angle: Array) -> tuple[Array, Array]:
+    """How far along its plane an arm reaches, in mm, and its base yaw, with the grip at polar coordinates (mm, rad), each (...).
+
+    A grip that lies ``planar[8]`` to the left of the plane is seen under a greater angle than the plane's, by its asin over the distance.
+    NaN for places nearer to the yaw axis than that.
+    """
+    xp, aside = namespace(distance), float(planar[8])
+    if aside == 0.0:
+        return distance, angle
+    share = aside / xp.where(distance >= abs(aside), distance, math.nan)
+    return distance * xp.sqrt(1 - share * share), angle - xp.arcsin(share)
+
+
+def out_of_plane(planar: Array, r: Array, yaw: Array) -> tuple[Array, Array]:
+    """Where (x, y) in mm a grip is that reaches ``r`` (...) along the plane at a base yaw (...): the inverse of :func:`into_plane`."""
+    xp, aside = namespace(r), float(planar[8])
+    cos, sin = xp.cos(yaw), xp.sin(yaw)
+    return (r * cos, r * sin) if aside == 0.0 else (r * cos - aside * sin, r * sin + aside * cos)
+
+
 def grip_speed(planar: Array, q: Array, rates: Array) -> Array:
     """Speed (...) of the grip in mm per unit, of joints ``q`` (..., >= 4) that change by ``rates`` (..., >= 4) a unit."""
     xp = namespace(q)
     r, z, _, _ = pitch_frames(planar, q)
     grip_r, grip_z = grip_in_plane(planar, q)
-    outward = ((z - grip_z[..., None]) * rates[..., 1:4]).sum(-1)
+    outward = ((z - grip_z[..., None]) * rates[..., 1:4]).sum(-1) - float(planar[8]) * rates[..., 0]
     upward = ((grip_r[..., None] - r) * rates[..., 1:4]).sum(-1)
     return xp.sqrt((grip_r * rates[..., 0]) ** 2 + outward**2 + upward**2)
 
@@ -225,7 +245,7 @@ def _limits(description: ArmDescription, limits_deg: Mapping[str, Sequence[float
 
 
 def _check_class(description: ArmDescription) -> tuple[list[Floats], Floats]:
-    """In-plane origins (x, z) in mm at zero of the five joints, and of the grip.
+    """In-plane origins (x, z) in mm at zero of the five joints, and the grip's (3,).
 
     Raises :class:`UnsupportedKinematics` unless yaw, three parallel pitch joints and roll follow each other in one plane, frames unturned.
     """
@@ -248,12 +268,12 @@ def _check_class(description: ArmDescription) -> tuple[list[Floats], Floats]:
     if abs(origins[0][0]) > _GEOMETRY_TOLERANCE:
         _unsupported(description, f"joint 'base_yaw' is {origins[0][0]:g} mm off the base frame's z axis")
     grip_mm = T[:3, 3]
-    if np.any(np.abs(grip_mm[1:] - (0.0, origins[4][1])) > _GEOMETRY_TOLERANCE):
+    if abs(grip_mm[2] - origins[4][1]) > _GEOMETRY_TOLERANCE:
         _unsupported(description, f"link {description.grasp_link!r} is off the axis of joint 'wrist_roll', so that rolling would move it")
     for name, vector in (("shoulder to elbow", origins[2] - origins[1]), ("elbow to wrist_pitch", origins[3] - origins[2])):
         if math.hypot(*vector) < _GEOMETRY_TOLERANCE:
             _unsupported(description, f"the link from {name} has no length")
-    return origins, grip_mm[[0, 2]]
+    return origins, grip_mm
 
 
 def _unsupported(description: ArmDescription, what: str) -> None:

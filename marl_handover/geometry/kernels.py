@@ -3,8 +3,8 @@
 Planar frame: r forward along the arm, t to its left, z up from the table; it turns with the base yaw. Wrist roll is 0 throughout.
 Arrays are packed for speed; :mod:`marl_handover.motion.collision_model` makes them:
 
-* ``planar`` (14,): shoulder (r, z), then the vectors shoulder-elbow, elbow-wrist, wrist-grip at zero, in mm; then two balls
-  (r, z, radius), one around base and turret, one in the wrist's frame around wrist, hand and what they hold.
+* ``planar`` (15,): shoulder (r, z), then the vectors shoulder-elbow, elbow-wrist, wrist-grip at zero, and the grip's t, in mm; then two
+  balls (r, z, radius), one around base and turret, one in the wrist's frame around wrist, hand and what they hold.
 * ``capsules`` (K, 9): level, two end points in the frame of that level's pivot, radius, half the length. Levels: 0 base, 1 turret,
   2 upper arm, 3 forearm, 4 wrist and hand (with what it holds).
 * ``obstacles`` (M, 9): two end points in the arm's base frame, radius, demanded clearance, half the length.
@@ -104,7 +104,7 @@ def into_arm_plane(obstacles: Floats, row: int, cos_yaw: float, sin_yaw: float, 
 @compiled
 def hand_ball(planar: Floats, frames: Floats, i: int, out: Floats, slot: int) -> None:
     """Put the ball around wrist, hand and what they hold into row ``slot`` of ``out``, as a segment without length, its radius left out."""
-    r, z = at_wrist(frames, i, planar[11], planar[12])
+    r, z = at_wrist(frames, i, planar[12], planar[13])
     for e in range(3):
         out[slot, 3 * e], out[slot, 3 * e + 1], out[slot, 3 * e + 2] = r, 0.0, z
     out[slot, 9] = 0.0
@@ -113,9 +113,9 @@ def hand_ball(planar: Floats, frames: Floats, i: int, out: Floats, slot: int) ->
 @compiled
 def hand_is_away(planar: Floats, frames: Floats, i: int, need: float) -> bool:
     """Whether wrist, hand and what they hold are surely farther than ``need`` from base and turret."""
-    r, z = at_wrist(frames, i, planar[11], planar[12])
-    dr, dz = r - planar[8], z - planar[9]
-    away = planar[10] + planar[13] + need
+    r, z = at_wrist(frames, i, planar[12], planar[13])
+    dr, dz = r - planar[9], z - planar[10]
+    away = planar[11] + planar[14] + need
     return dr * dr + dz * dz > away * away
 
 

@@ -19,9 +19,9 @@ from marl_handover.cell import Cell
 from marl_handover.cell.build import CellModel
 from marl_handover.config import CentralisedConfig, MotionConfig
 from marl_handover.geometry.capsules import segment_distance
-from marl_handover.geometry.closed_form import pitch_frames, planar_ik
+from marl_handover.geometry.closed_form import into_plane, pitch_frames, planar_ik
 from marl_handover.motion.collision_model import arm_collision_model, out_of_reach
-from marl_handover.motion.initial_guesses import GRIP_LEAST_MM, RUN_UP_MM, SAMPLES, WRIST_LEAST_MM
+from marl_handover.motion.initial_guesses import RUN_UP_MM, SAMPLES, hand_pitch, proportions
 from marl_handover.motion.objective import first_moving
 from marl_handover.motion.planner import STILL_MM, MotionPlanner
 from marl_handover.motion.trajectory import basis, sample_places, sampled_basis
@@ -142,7 +142,8 @@ class MotionCheck:
         self.pairs = [(int(one), int(other)) for one, other in body.held_pairs]
         self.link_balls = self._balls_of_links()
         # What the planner sets around the path of a loaded hand; the middle of the shared space is in every arm's reach.
-        scenes = [planner.carrying(arm, np.zeros(2), np.zeros(2), planner.home_rad)[0].scene for arm in range(model.cell.num_arms)]
+        arms = range(model.cell.num_arms)
+        scenes = [planner.carrying(arm, np.zeros(2), np.zeros(2), planner.others_home_rad(arm))[0].scene for arm in arms]
         others = np.stack([scene.obstacles for scene in scenes])
         others = others[:, ~np.all([out_of_reach(body, rows) for rows in others], axis=0)]
         self.constants = {
@@ -196,8 +197,10 @@ class MotionCheck:
         r, _ = frames.at(4, self.planar[6], self.planar[7])
         share = ends.share(self.motion.lift_scale_mm)
         ramp = torch.ones_like(r)
+        aside = float(self.planar[8])
+        x_mm, y_mm = r * frames.cos_yaw - aside * frames.sin_yaw, r * frames.sin_yaw + aside * frames.cos_yaw
         for place in ends.places_mm.unbind(-2):
-            away = (r * frames.cos_yaw - place[:, None, 0]).square() + (r * frames.sin_yaw - place[:, None, 1]).square()
+            away = (x_mm - place[:, None, 0]).square() + (y_mm - place[:, None, 1]).square()
             ramp = ramp * (1 - (-away / (share * self.motion.lift_scale_mm).square()[:, None]).exp())
         asked = (share * self.motion.ground_clearance_mm)[:, None] * ramp - ROUNDING_MM
         for x, z in self.edges:
@@ -338,9 +341,8 @@ class MotionNumbers:
     """
 
     def __init__(self, model: CellModel, motion: MotionConfig, settings: CentralisedConfig) -> None:
-        body = arm_collision_model(model, motion)
-        self.settings, self.motion = settings, motion
-        self.planar = model.arm.planar
+        self.settings, self.motion, self.planar = settings, motion, model.arm.planar
+        body = arm_collision_model(model, motion, 0)
         self.pick_height_mm = float(model.cell.pick_height_mm)
         self.count = JOINTS * (settings.control_points - 2)
         self.limits = torch.tensor(body.limits, dtype=torch.float32)
@@ -365,8 +367,8 @@ class MotionNumbers:
 
     def end_joints(self, ends: Ends) -> Tensor:
         """Joints (n, 2, 4) with the grip at both ends, level and at the pick height; at the limits where rounding would pass them."""
-        radius = ends.radius_mm.float()
-        joints = self._elbow_up(radius, torch.full_like(radius, self.pick_height_mm), torch.zeros_like(radius), ends.yaw_rad.float())
+        radius, yaw = into_plane(self.planar, ends.radius_mm.float(), ends.yaw_rad.float())
+        joints = self._elbow_up(radius, torch.full_like(radius, self.pick_height_mm), torch.zeros_like(radius), yaw)
         low, high = self.limits.to(radius.device).unbind(-1)
         return joints.clamp(low, high)
 
@@ -380,12 +382,11 @@ class MotionNumbers:
         start, end = ends.places_mm.float().unbind(-2)
         places = start[:, None] + (end - start)[:, None] * t[:, None]
         distance = (end - start).square().sum(-1).sqrt()[:, None]
-        radius = places.square().sum(-1).sqrt().clamp_min(GRIP_LEAST_MM)
+        radius, yaw = into_plane(self.planar, places.square().sum(-1).sqrt(), torch.atan2(places[..., 1], places[..., 0]))
+        radius = radius.clamp_min(proportions(self.planar).grip_least_mm)
         lift = self.motion.lift_mm * ends.share(self.motion.lift_scale_mm).float()[:, None]
         height = self.pick_height_mm + lift * (torch.minimum(t, 1 - t) * distance / RUN_UP_MM).clamp_max(1.0)
-        tool = math.hypot(*self.planar[6:8])
-        down = -((radius - WRIST_LEAST_MM) / tool).clamp(0.0, 1.0).arccos()
-        samples = self._elbow_up(radius, height, down, torch.atan2(places[..., 1], places[..., 0]))
+        samples = self._elbow_up(radius, height, hand_pitch(self.planar, radius), yaw)
         low, high = self.limits.to(device).unbind(-1)
         even = torch.linspace(0.0, 1.0, SAMPLES, device=device)[:, None]
         line = joints[:, :1] + (joints[:, 1:] - joints[:, :1]) * even

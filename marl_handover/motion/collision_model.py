@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from marl_handover.cell.build import CellModel
 from marl_handover.config import BlockConfig, MotionConfig
 from marl_handover.errors import UrdfError
-from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.capsules import Capsule, capsule_pairs, joints_before
+from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.kernels import can_meet, world_shapes
 from marl_handover.geometry.se3 import apply, flat_pose
 
@@ -53,7 +53,7 @@ class Scene(NamedTuple):
     """One arm, what it holds and what stands around it. Lengths in mm; layouts of the rows: :mod:`marl_handover.geometry.kernels`.
 
     Attributes:
-        planar: (14,) the arm's links.
+        planar: (15,) the arm's links.
         capsules: (K, 9) its shapes, sorted by level, then those of the held block.
         carried: index of the first shape that is held.
         pairs: (P, 2) indices of shapes that must not touch; first those of base or turret with the hand.
@@ -79,9 +79,18 @@ class Scene(NamedTuple):
     profile: Floats
 
 
-def arm_collision_model(model: CellModel, motion: MotionConfig) -> CollisionModel:
-    """The shapes of a cell's arm, its fingers opened by ``finger_travel_mm``."""
-    arm = model.arm
+def collision_models(model: CellModel, motion: MotionConfig) -> tuple[CollisionModel, ...]:
+    """The shapes of each of a cell's arms; arms of one robot share theirs."""
+    made: dict[int, CollisionModel] = {}
+    for index, arm in enumerate(model.arms):
+        if id(arm) not in made:
+            made[id(arm)] = arm_collision_model(model, motion, index)
+    return tuple(made[id(arm)] for arm in model.arms)
+
+
+def arm_collision_model(model: CellModel, motion: MotionConfig, index: int) -> CollisionModel:
+    """The shapes of a cell's arm ``index``, its fingers opened by ``finger_travel_mm``."""
+    arm = model.arms[index]
     planar = arm.planar
     shapes, first, second = capsule_pairs(arm.description)
     if not shapes:
@@ -103,9 +112,9 @@ def arm_collision_model(model: CellModel, motion: MotionConfig) -> CollisionMode
     capsules = shaped[order]
     pairs = np.array(sorted((rank[i], rank[j]) for i, j in zip(first, second, strict=True)), np.int64).reshape(-1, 2)
     tool = arm.tool_mm
-    grip_to_table = model.cell.pick_height_mm
+    grip_to_table = model.cell.pick_heights_mm[index]
     block = [
-        [4.0, *_shifted(shape.start_mm, tool), *_shifted(shape.end_mm, tool), shape.radius_mm]
+        [4.0, *_shifted(shape.start_mm, arm), *_shifted(shape.end_mm, arm), shape.radius_mm]
         for shape in block_capsules(model.cell.config.block, grip_to_table)
     ]
     held = np.concatenate([capsules, _with_half_lengths(block, 1)])
@@ -118,7 +127,7 @@ def arm_collision_model(model: CellModel, motion: MotionConfig) -> CollisionMode
     need = motion.self_clearance_mm + MARGIN_MM
     steps = np.maximum(np.ceil((limits[1:, 1] - limits[1:, 0]) / GRID_RAD), 2).astype(np.int64)
     meeting = [can_meet(planar, held, a, b, held[a, 7] + held[b, 7] + need, limits, steps) for a, b in all_pairs]
-    all_pairs = all_pairs[np.array(meeting)]
+    all_pairs = all_pairs[np.array(meeting, bool)]
     fixed, hand = held[held[:, 0] < 2], held[held[:, 0] >= 4]
     grouped = (held[all_pairs[:, 0], 0] < 2) & (held[all_pairs[:, 1], 0] >= 4)
     all_pairs = np.concatenate([all_pairs[grouped], all_pairs[~grouped]])  # the kernels skip the first ones together
@@ -152,9 +161,9 @@ def block_capsules(block: BlockConfig, grip_to_table_mm: float) -> list[Capsule]
 
 
 def standing_arm(
-    body: CollisionModel, arm: ArmModel, motion: MotionConfig, q: Floats, x_mm: float, y_mm: float, facing_rad: float
+    body: CollisionModel, arm: ClosedFormArm, motion: MotionConfig, q: Floats, x_mm: float, y_mm: float, facing_rad: float
 ) -> Floats:
-    """Obstacle rows (M, 9) of another arm of the same kind that holds still at ``q`` (5,), its base at a pose in the moving arm's frame."""
+    """Obstacle rows (M, 9) of an ``arm``, its shapes ``body``, that holds still at ``q`` (5,), its base in the moving arm's frame."""
     bare = body.capsules
     if q[4] == 0.0:
         shapes = world_shapes(q[None, :4].copy(), body.planar, bare, x_mm, y_mm, facing_rad)[0]
@@ -172,8 +181,8 @@ def standing_arm(
 
 
 def standing_block(model: CellModel, motion: MotionConfig, place_mm: Floats) -> Floats:
-    """Obstacle rows of the block standing at ``place_mm`` (2,) of the moving arm's base frame."""
-    height = model.cell.pick_height_mm
+    """Obstacle rows of the block standing at ``place_mm`` (2,) of a moving arm's base frame."""
+    height = model.cell.pick_heights_mm[0]  # where its frame is; its shapes are over the table
     at = np.array([place_mm[0], place_mm[1], height])
     shapes = block_capsules(model.cell.config.block, height)
     rows = [[*(at + shape.start_mm), *(at + shape.end_mm), shape.radius_mm, motion.block_clearance_mm] for shape in shapes]
@@ -190,9 +199,9 @@ def ball_around(obstacles: Floats) -> Floats:
     return np.array([*centre, away.max(), obstacles[:, 7].max()])
 
 
-def _shifted(point_mm: tuple[float, float, float], tool_mm: Floats) -> tuple[float, float, float]:
+def _shifted(point_mm: tuple[float, float, float], arm: ClosedFormArm) -> tuple[float, float, float]:
     """A point of the grip's frame in the wrist's."""
-    return point_mm[0] + tool_mm[0], point_mm[1], point_mm[2] + tool_mm[1]
+    return point_mm[0] + arm.tool_mm[0], point_mm[1] + arm.lateral_mm, point_mm[2] + arm.tool_mm[1]
 
 
 def _planar_ball(capsules: Floats) -> Floats:

@@ -104,11 +104,12 @@ def _placed(planner: MotionPlanner, motion: TransferMotion, step: float) -> tupl
     joints = np.stack([np.interp(times, t, q[:, joint]) for joint in range(4)], axis=-1)
     names = np.array([phase.name for phase in phases])
     at = np.searchsorted([phase.t_s[-1] for phase in phases], times - 1e-9).clip(max=len(phases) - 1)
-    bare, held = len(planner.collision_model.capsules), len(planner.collision_model.held)
+    body = planner.collision_models[motion.arm]
+    bare, held = len(body.capsules), len(body.held)
     counts = np.where(np.isin(names[at], WITH_BLOCK), held, bare)
     base = planner.model.cell.bases[motion.arm]
-    shapes = world_shapes(joints, planner.collision_model.planar, planner.collision_model.held, base.x_mm, base.y_mm, base.facing_rad)
-    moves = np.abs(np.diff(joints, axis=0)) @ planner.collision_model.levers_mm
+    shapes = world_shapes(joints, body.planar, body.held, base.x_mm, base.y_mm, base.facing_rad)
+    moves = np.abs(np.diff(joints, axis=0)) @ body.levers_mm
     return shapes, counts, np.maximum(np.append(moves, 0.0), np.append(0.0, moves))
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from marl_handover.cell import CellModel, build_cell, cell_config
 from marl_handover.config import CellConfig, MotionConfig, require_choice
 from marl_handover.errors import HandoverError, InvalidSetting
+from marl_handover.motion.home import parked_poses
 from marl_handover.motion.trajectory import NoPath, OutOfArmsReach, PickPlacePaths
 
 if TYPE_CHECKING:
@@ -68,7 +69,8 @@ class ExecutorAgent:
         except HandoverError as failure:
             self.last_refusal, reason = str(failure), _code(failure)
             paths = PickPlacePaths(*(np.tile(joints, (self.motion.control_points, 1)) for _ in range(3)))
-        lower, upper = self.model.arm.lower_rad.astype(np.float32), self.model.arm.upper_rad.astype(np.float32)
+        arm = self.model.arms[self.arm]
+        lower, upper = arm.lower_rad.astype(np.float32), arm.upper_rad.astype(np.float32)
         willing = np.int64(self.last_refusal is None)
         points = np.clip(np.stack(paths).astype(np.float32), lower, upper)
         return {"paths": points, "grasp": willing, "release": willing, "reason": np.int64(reason)}
@@ -80,7 +82,7 @@ class ExecutorAgent:
             joints_rad,
             grasp_joints(self.model, self.arm, "pick up", pick_mm),
             grasp_joints(self.model, self.arm, "place", place_mm),
-            np.radians(self.motion.parked_deg),
+            parked_poses(self.model, self.motion)[self.arm],
         )
         return PickPlacePaths(*(np.linspace(start, end, self.motion.control_points) for start, end in pairwise(ends)))
 

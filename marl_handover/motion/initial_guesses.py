@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.arrays import Array, namespace
+from marl_handover.geometry.closed_form import into_plane
 from marl_handover.geometry.kernels import elbow_up
 from marl_handover.motion.collision_model import CollisionModel
 from marl_handover.motion.trajectory import basis, sample_places, sampled_basis
@@ -19,11 +22,47 @@ SAMPLES = 33
 RUN_UP_MM = 35.0
 """A guess is at full height this far from an end: where the string over the lift-over profile leaves the slope."""
 
-WRIST_LEAST_MM, GRIP_LEAST_MM = 45.0, 75.0
-"""How near guesses let wrist and grip come to the yaw axis."""
+NEAR_SHARES = (0.1, 0.2, 0.35, 0.45)
+"""How far in front of the shoulder guesses let the wrist and the grip come, and where they draw the arm in to, as shares of its length."""
 
-POSTURES_DEG = ((120.0, -130.0, 60.0), (140.0, -115.0, 70.0), (130.0, -160.0, 60.0))
-"""Shoulder, elbow and wrist pitch half-way of the guesses that draw the arm in: reaching up, upright, folded."""
+POSTURES_DEG = ((120.0, -10.0, 50.0), (140.0, 25.0, 95.0), (130.0, -30.0, 30.0))
+"""Where upper arm, forearm and hand point half-way of the guesses that draw the arm in: reaching up, upright, folded."""
+
+LEVERS_MM, LENGTH_MM = np.array([190.0, 190.0, 130.0, 100.0]), 300.0
+"""How far a radian of yaw and the three pitches moves the grip of an arm of this length."""
+
+
+class Proportions(NamedTuple):
+    """What guesses take from an arm's size: its whole length, how near to the yaw axis its wrist and its grip may come, two radii to draw
+    it in to, all in mm; which way its hand points at zero, in rad; and joints (3,) of the pitches in :data:`POSTURES_DEG`.
+    """
+
+    length_mm: float
+    wrist_least_mm: float
+    grip_least_mm: float
+    near_mm: float
+    middle_mm: float
+    hand_rad: float
+    postures_rad: tuple[Floats, ...]
+
+
+def proportions(planar: Floats) -> Proportions:
+    """Those of an arm with these links, as :mod:`marl_handover.geometry.kernels` has them."""
+    return _proportions(tuple(planar[:8].tolist()))
+
+
+@lru_cache(maxsize=16)
+def _proportions(planar: tuple[float, ...]) -> Proportions:
+    links = [planar[2:4], planar[4:6], planar[6:8]]
+    length = round(sum(math.hypot(*link) for link in links), 6)
+    slopes = [math.degrees(math.atan2(link[1], link[0])) for link in links]
+    postures = []
+    for directions in POSTURES_DEG:
+        upper, fore, hand = (direction - slope for direction, slope in zip(directions, slopes, strict=True))
+        postures.append(np.radians((upper, fore - upper, hand - fore)))
+    wrist, grip, near, middle = (round(planar[0] + share * length, 6) for share in NEAR_SHARES)
+    return Proportions(length, wrist, grip, near, middle, math.radians(slopes[2]), tuple(postures))
+
 
 _BEND_RAD = np.array([0.5, 0.35, 0.35, 0.5])
 
@@ -45,13 +84,14 @@ def fit_control_points(samples: Floats, limits: Floats, control_points: int, deg
 
 def carrying_guesses(body: CollisionModel, ends_q: Floats, ends_mm: Floats, pick_height_mm: float, lift_mm: float) -> Iterator[Floats]:
     """Joint samples (SAMPLES, 4) of structured guesses to carry the block between ``ends_mm`` (2, 2), joints ``ends_q`` (2, 4)."""
-    yield _straight(body, ends_q, ends_mm, pick_height_mm, lift_mm, GRIP_LEAST_MM)
+    size = proportions(body.planar)
+    yield _straight(body, ends_q, ends_mm, pick_height_mm, lift_mm, size.grip_least_mm)
     yield _around(body, ends_q, ends_mm, pick_height_mm, lift_mm, None)
-    yield _around(body, ends_q, ends_mm, pick_height_mm, lift_mm, 150.0)
-    yield _posture(ends_q, POSTURES_DEG[0])
-    yield _straight(body, ends_q, ends_mm, pick_height_mm, lift_mm, 120.0)
-    yield _posture(ends_q, POSTURES_DEG[1])
-    yield _posture(ends_q, POSTURES_DEG[2])
+    yield _around(body, ends_q, ends_mm, pick_height_mm, lift_mm, size.middle_mm)
+    yield _posture(ends_q, size.postures_rad[0])
+    yield _straight(body, ends_q, ends_mm, pick_height_mm, lift_mm, size.near_mm)
+    yield _posture(ends_q, size.postures_rad[1])
+    yield _posture(ends_q, size.postures_rad[2])
 
 
 def reaching_guesses(body: CollisionModel, ends_q: Floats, pin_mm: Floats, above_mm: float, pin_last: bool) -> Iterator[Floats]:
@@ -59,8 +99,8 @@ def reaching_guesses(body: CollisionModel, ends_q: Floats, pin_mm: Floats, above
     t = _even()[:, None]
     away = ends_q[0] if pin_last else ends_q[1]
     pin = ends_q[1] if pin_last else ends_q[0]
-    radius, height = np.array([math.hypot(pin_mm[0], pin_mm[1])]), np.array([pin_mm[2] + above_mm])
-    above = _lifted(body.planar, radius, pin[:1], height)[0]
+    radius, _ = into_plane(body.planar, np.array([math.hypot(pin_mm[0], pin_mm[1])]), pin[:1])
+    above = _lifted(body.planar, radius, pin[:1], np.array([pin_mm[2] + above_mm]))[0]
     if np.isnan(above).any():
         above = pin
     for order in ("together", "turn first", "turn last"):
@@ -86,16 +126,16 @@ def random_bend(points: Floats, limits: Floats, degree: int, seed: int) -> Float
 
 
 @lru_cache(maxsize=16)
-def smoothing_metric(control_points: int, degree: int) -> Floats:
+def smoothing_metric(control_points: int, degree: int, length_mm: float) -> Floats:
     """The inverse (4 (N - 2), 4 (N - 2)) of how the length of a path of 1 mm grows when its inner control points bend it.
 
-    A path of length L has this divided by L for its curvature; it is the optimiser's first guess of the inverse Hessian.
+    ``length_mm`` is the arm's. A path of length L has this divided by L for its curvature; it is the optimiser's first guess of the inverse
+    Hessian.
     """
     B = basis(np.linspace(0.0, 1.0, 49), control_points, degree)
     D = np.diff(B[:, 1:-1], axis=0)
     inner = np.linalg.inv(48 * D.T @ D + 1e-3 * np.eye(control_points - 2))
-    lever_mm = np.array([190.0, 190.0, 130.0, 100.0])
-    return np.kron(inner, np.diag(1.0 / lever_mm**2))
+    return np.kron(inner, np.diag(1.0 / (length_mm / LENGTH_MM * LEVERS_MM) ** 2))
 
 
 def _even() -> Floats:
@@ -115,12 +155,16 @@ def _lifted(planar: Floats, r: Floats, yaw: Floats, z: Floats) -> Floats:
     joints = np.empty((len(r), 4))
     joints[:, 0] = yaw
     pitches = np.empty((len(r), 3))
-    tool = math.hypot(planar[6], planar[7])
-    # Near the base the hand points down, so that the wrist does not come too near the shoulder.
-    down = -np.arccos(np.clip((r - WRIST_LEAST_MM) / tool, 0.0, 1.0))
-    elbow_up(planar, r, z, down, pitches)
+    elbow_up(planar, r, z, hand_pitch(planar, r), pitches)
     joints[:, 1:] = pitches
     return joints
+
+
+def hand_pitch(planar: Floats, r: Array) -> Array:
+    """Pitch (...) of the hand with the grip at ``r`` (...) mm: level, but near the base as far down as keeps the wrist off the shoulder."""
+    size, tool, xp = proportions(planar), math.hypot(planar[6], planar[7]), namespace(r)
+    down = -xp.arccos(xp.clip((r - size.wrist_least_mm) / tool, 0.0, 1.0)) - size.hand_rad
+    return xp.clip(down, None, 0.0)
 
 
 def _straight(body: CollisionModel, ends_q: Floats, ends_mm: Floats, pick_height_mm: float, lift_mm: float, r_least_mm: float) -> Floats:
@@ -128,9 +172,9 @@ def _straight(body: CollisionModel, ends_q: Floats, ends_mm: Floats, pick_height
     t = sample_places(SAMPLES, 0.5)
     distance = math.dist(*ends_mm)
     p = ends_mm[0] + (ends_mm[1] - ends_mm[0]) * t[:, None]
-    r = np.maximum(np.hypot(p[:, 0], p[:, 1]), r_least_mm)
+    r, yaw = into_plane(body.planar, np.hypot(p[:, 0], p[:, 1]), np.arctan2(p[:, 1], p[:, 0]))
     height = pick_height_mm + lift_mm * np.minimum(1.0, np.minimum(t, 1.0 - t) * distance / RUN_UP_MM)
-    return _inside(_lifted(body.planar, r, np.arctan2(p[:, 1], p[:, 0]), height), ends_q, body.limits)
+    return _inside(_lifted(body.planar, np.maximum(r, r_least_mm), yaw, height), ends_q, body.limits)
 
 
 def _around(
@@ -139,7 +183,7 @@ def _around(
     """Up, around the base at an even or at a given radius, and down."""
     t = _even()
     near = np.minimum(1.0, np.minimum(t, 1.0 - t) * 6.0)
-    radii = np.hypot(ends_mm[:, 0], ends_mm[:, 1])
+    radii, _ = into_plane(body.planar, np.hypot(ends_mm[:, 0], ends_mm[:, 1]), ends_q[:, 0])
     r = radii[0] + (radii[1] - radii[0]) * t
     if radius_mm is not None:
         r = r + (radius_mm - r) * near
@@ -147,10 +191,10 @@ def _around(
     return _inside(_lifted(body.planar, r, yaw, pick_height_mm + lift_mm * near), ends_q, body.limits)
 
 
-def _posture(ends_q: Floats, posture_deg: tuple[float, float, float]) -> Floats:
+def _posture(ends_q: Floats, posture_rad: Floats) -> Floats:
     """Through a posture half-way, the yaw turning evenly."""
     t = _even()[:, None]
     path = ends_q[0] + (ends_q[1] - ends_q[0]) * t
-    path[:, 1:] += (np.radians(posture_deg) - path[:, 1:]) * np.sin(math.pi * t) ** 0.7
+    path[:, 1:] += (posture_rad - path[:, 1:]) * np.sin(math.pi * t) ** 0.7
     path[0], path[-1] = ends_q
     return path

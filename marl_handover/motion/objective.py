@@ -103,7 +103,7 @@ def lagrangian(Q: Floats, scene: Scene, penalties: Penalty, grad: Floats, values
     samples, K, P = Q.shape[0], capsules.shape[0], pairs.shape[0]
     frames, grip, ends, point, slope = np.empty((samples, 5, 4)), np.empty((samples, 3)), np.empty((K, 10)), np.empty(6), np.empty(3)
     worst, contact, placed, close = np.empty(K), np.empty((K, 6)), np.empty((1, 10)), np.empty(K, np.int64)
-    first, grouped = first_moving(capsules), 0
+    first, grouped, aside = first_moving(capsules), 0, planar[8]
     while grouped < P and pairs[grouped, 0] < first and capsules[pairs[grouped, 1], 0] >= 4.0:
         grouped += 1
     grad[:, :] = 0.0
@@ -113,7 +113,7 @@ def lagrangian(Q: Floats, scene: Scene, penalties: Penalty, grad: Floats, values
         forward_kinematics(planar, Q, i, frames, i)
         r, z = at_wrist(frames, i, planar[6], planar[7])
         cy, sy = math.cos(Q[i, 0]), math.sin(Q[i, 0])
-        grip[i, 0], grip[i, 1], grip[i, 2] = r * cy, r * sy, z
+        grip[i, 0], grip[i, 1], grip[i, 2] = r * cy - aside * sy, r * sy + aside * cy, z
         if i == 0 or i == samples - 1:
             continue  # the ends are given
         place_capsules(capsules, frames, i, ends)
@@ -127,11 +127,13 @@ def lagrangian(Q: Floats, scene: Scene, penalties: Penalty, grad: Floats, values
         sr, st = slope[1] * cy + slope[2] * sy, slope[2] * cy - slope[1] * sy
         before = 2 * K + P
         penalty += _height(
-            i, before, r, z, r, z, scene.pick_height + profile[6] * slope[0], profile[6], sr, st, lam, rho, frames, grad, values
+            i, before, r, z, r, aside, z, scene.pick_height + profile[6] * slope[0], profile[6], sr, st, lam, rho, frames, grad, values
         )
         for e in range(edges.shape[0]):
             er, ez = at_wrist(frames, i, edges[e, 0], edges[e, 1])
-            penalty += _height(i, before + 1 + e, er, ez, r, z, profile[7] * slope[0], profile[7], sr, st, lam, rho, frames, grad, values)
+            penalty += _height(
+                i, before + 1 + e, er, ez, r, aside, z, profile[7] * slope[0], profile[7], sr, st, lam, rho, frames, grad, values
+            )
     return penalty + _length(Q, planar, penalties.step, penalties.weights, frames, grip, grad)
 
 
@@ -232,16 +234,16 @@ def _table(
 
 @compiled
 def _height(
-    i: int, column: int, pr: float, pz: float, r: float, z: float, demanded: float, rise: float, sr: float, st: float, lam: Floats,
-    rho: float, frames: Floats, grad: Floats, values: Floats,
+    i: int, column: int, pr: float, pz: float, r: float, t: float, z: float, demanded: float, rise: float, sr: float, st: float,
+    lam: Floats, rho: float, frames: Floats, grad: Floats, values: Floats,
 ) -> float:  # fmt: skip
-    """A point (pr, pz) of the hand over a height that depends on where the grip (r, z) is: ``rise`` x (sr, st) is its slope."""
+    """A point (pr, pz) of the hand over a height that depends on where the grip (r, t, z) is: ``rise`` x (sr, st) is its slope."""
     over = demanded - pz
     values[i, column] = over
     h = _charge(lam[i, column], rho, over)
     if h > 0.0:
         jacobian_transpose(frames, i, 4, pr, 0.0, pz, 0.0, 0.0, 1.0, -h, grad)
-        jacobian_transpose(frames, i, 4, r, 0.0, z, sr, st, 0.0, h * rise, grad)
+        jacobian_transpose(frames, i, 4, r, t, z, sr, st, 0.0, h * rise, grad)
     return 0.5 * h * h / rho
 
 
@@ -269,7 +271,7 @@ def _length(Q: Floats, planar: Floats, step: Floats, weights: Floats, frames: Fl
             cy, sy = math.cos(Q[i, 0]), math.sin(Q[i, 0])
             r, z = at_wrist(frames, i, planar[6], planar[7])
             gx, gy = px - fx, py - fy
-            jacobian_transpose(frames, i, 4, r, 0.0, z, cy * gx + sy * gy, cy * gy - sy * gx, pz - fz, 1.0, grad)
+            jacobian_transpose(frames, i, 4, r, planar[8], z, cy * gx + sy * gy, cy * gy - sy * gx, pz - fz, 1.0, grad)
         px, py, pz = fx, fy, fz
         for j in range(4):
             pull = weights[1] * LEVER_MM * LEVER_MM / (turning * step[i]) * (Q[i + 1, j] - Q[i, j])
@@ -322,7 +324,7 @@ def dense_margins(Q: Floats, scene: Scene, out: Floats) -> float:
             if stride > 1:
                 continue
             r, z = at_wrist(frames, 0, planar[6], planar[7])
-            x, y = r * cy, r * sy
+            x, y = r * cy - planar[8] * sy, r * sy + planar[8] * cy
             if i > 0:
                 length += math.sqrt((x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2)
             px, py, pz = x, y, z
@@ -345,7 +347,7 @@ def _around(
         into_arm_plane(obstacles, j, cy, sy, placed, 0)
         field = 0 if j < arm_rows else 1
         away = obstacles[j, 6] + obstacles[j, 7]
-        for k in range(first, hand if broad_phase(placed, 1, placed, 0, away + planar[13] + out[field]) else capsules.shape[0]):
+        for k in range(first, hand if broad_phase(placed, 1, placed, 0, away + planar[14] + out[field]) else capsules.shape[0]):
             need = away + capsules[k, 7]
             if not broad_phase(ends, k, placed, 0, need + out[field]):
                 out[field] = min(out[field], closest_points(ends, k, placed, 0, point) - need)

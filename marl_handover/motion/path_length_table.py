@@ -1,9 +1,9 @@
 """The path cost of eq. (3) for thousands of transfers at once: a table of what the optimiser finds, interpolated.
 
-Both arms are alike and turn about their base, so that, with the other arm parked clear of all paths, the length of a transfer depends on
-no more than both radii and the yaw between the two places, and is the same either way. No path is shorter than a string pulled over the
-lift-over profile, which depends on the distance alone; the table holds what the arm adds to it: 0.3 mm for short ways, up to
-50 mm for half a turn.
+An arm turns about its base, so that, with the other arm parked clear of all paths, the length of a transfer depends on no more than both
+radii and the yaw between the two places, and is the same either way. Arms that are alike share a table. No path is shorter than a string
+pulled over the lift-over profile, which depends on the distance alone; the table holds what the arm adds to it: 0.3 mm for short ways, up
+to 50 mm for half a turn.
 
 Each node is the shortest path of all the starts the planner has. Against the planner itself, which stops at its second path, on 1,000
 random transfers of the paper cell: median 0.1 mm (0.07 %), 95th percentile 2.4 mm (0.75 %), largest 67 mm (15 %). The large ones are
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from marl_handover.arrays import Array, namespace, select, wrap
 from marl_handover.cell import Cell, build_cell
-from marl_handover.cell.arm import REACH_TOLERANCE_MM
+from marl_handover.cell.arm import REACH_TOLERANCE_MM, Arm
 from marl_handover.cell.build import robot_of
 from marl_handover.config import CellConfig, MotionConfig, RobotConfig, TaskConfig
 from marl_handover.errors import CannotWrite, CorruptFile, HandoverError, MissingFile
@@ -116,6 +116,21 @@ class PathLengthTable:
         return {}
 
 
+@dataclass(frozen=True, eq=False)
+class TablePerArm:
+    """A :data:`~marl_handover.task.rules.MotionCost` for arms that differ: each has a table of its own."""
+
+    tables: tuple[PathLengthTable, ...]
+
+    def __call__(self, cell: Cell, arm: Array, start_mm: Array, end_mm: Array) -> Array:
+        """As :meth:`PathLengthTable.__call__`."""
+        xp = namespace(start_mm)
+        length = self.tables[0](cell, arm, start_mm, end_mm)
+        for index, table in enumerate(self.tables[1:], 1):
+            length = xp.where(arm == index, table(cell, arm, start_mm, end_mm), length)
+        return length
+
+
 def interpolated(table: Array, places: list[Array]) -> Array:
     """A table of n dimensions, linear between its nodes and constant beyond them, at n ``places`` (...) counted in nodes: (...)."""
     xp, flat = namespace(table), table.reshape(-1)
@@ -137,27 +152,38 @@ def motion_cost(cell: Cell, task: TaskConfig, motion: MotionConfig | None = None
 
     A cell other than the shipped one has its table built at first use, in about a minute, and kept in the user's cache folder.
     """
-    return straight_line_mm if task.reward.motion_weight == 0 else path_length_table(cell, motion or MotionConfig())
+    if task.reward.motion_weight == 0:
+        return straight_line_mm
+    motion = motion or MotionConfig()
+    if _alike(cell):
+        return path_length_table(cell, motion)
+    return TablePerArm(tuple(path_length_table(cell, motion, arm) for arm in range(cell.num_arms)))
 
 
 _TABLES: dict[str, PathLengthTable] = {}
 
 
-def path_length_table(cell: Cell, motion: MotionConfig) -> PathLengthTable:
-    """The table of a cell: the shipped one, one kept from before, or a new one."""
-    key = settings_key(cell, motion)
+def path_length_table(cell: Cell, motion: MotionConfig, arm: int = 0) -> PathLengthTable:
+    """The table of a cell's arm: the shipped one, one kept from before, or a new one."""
+    key = settings_key(cell, motion, arm)
     if key not in _TABLES:
-        _TABLES[key] = _found(key) or _kept(cell, motion, key)
+        _TABLES[key] = _found(key) or _kept(cell, motion, key, arm)
     return _TABLES[key]
 
 
 def known_table(cell: Cell, motion: MotionConfig) -> PathLengthTable | None:
-    """The table of a cell, if it is shipped or was kept from before; nothing is built."""
-    return _found(settings_key(cell, motion))
+    """The table of a cell of arms that are alike, if it is shipped or was kept from before; nothing is built."""
+    return _found(settings_key(cell, motion)) if _alike(cell) else None
 
 
-def settings_key(cell: Cell, motion: MotionConfig) -> str:
-    """A short name of all that the path lengths depend on: 16 hexadecimal digits.
+def _alike(cell: Cell) -> bool:
+    """Whether all arms are of one robot and reach alike."""
+    first = cell.arms[0]
+    return all((arm.robot, arm.r_min_mm, arm.r_max_mm) == (first.robot, first.r_min_mm, first.r_max_mm) for arm in cell.arms)
+
+
+def settings_key(cell: Cell, motion: MotionConfig, arm: int = 0) -> str:
+    """A short name of all that the path lengths of an arm depend on: 16 hexadecimal digits.
 
     The name of a cell and the part of its chart in use do not count, nor what concerns only the timing; and a table holds what the
     optimiser finds, whatever method plans.
@@ -170,6 +196,8 @@ def settings_key(cell: Cell, motion: MotionConfig) -> str:
     shape = _shape(cell.config, robot)
     digest = hashlib.sha256(repr((RADII, YAWS, DISTANCES, shape, settings)).encode())
     digest.update(Path(robot.urdf).read_bytes())
+    if not _alike(cell):
+        digest.update(repr((arm, [Path(robot_of(cell.config, each.robot).urdf).read_bytes() for each in cell.arms])).encode())
     return digest.hexdigest()[:16]
 
 
@@ -204,8 +232,8 @@ def read_table(path: Path, key: str) -> PathLengthTable:
     return table
 
 
-def build_table(cell: Cell, motion: MotionConfig, *, progress: bool = True) -> PathLengthTable:
-    """Plan a transfer for every node, both places symmetric about the middle of the yaw range, the other arm parked.
+def build_table(cell: Cell, motion: MotionConfig, arm: int = 0, *, progress: bool = True) -> PathLengthTable:
+    """Plan a transfer of ``arm`` for every node, both places symmetric about the middle of the yaw range, the other arm parked.
 
     A node without a path gets the largest excess found at all: it is to be dear, not free.
 
@@ -215,34 +243,35 @@ def build_table(cell: Cell, motion: MotionConfig, *, progress: bool = True) -> P
     from marl_handover.motion.planner import MotionPlanner
 
     planner = MotionPlanner(build_cell(cell.config), motion)
-    middle, span = sum(cell.yaw_rad) / 2, min(cell.yaw_rad[1] - cell.yaw_rad[0], math.pi)
-    radii, yaws = np.linspace(cell.r_min_mm, cell.r_max_mm, RADII), np.linspace(0.0, span, YAWS)
+    ring = cell.arms[arm]
+    middle, span = sum(ring.yaw_rad) / 2, min(ring.yaw_rad[1] - ring.yaw_rad[0], math.pi)
+    radii, yaws = np.linspace(ring.r_min_mm, ring.r_max_mm, RADII), np.linspace(0.0, span, YAWS)
     excess = np.zeros((RADII, RADII, YAWS))
     nodes: Iterable[tuple[int, int]] = [(i, j) for i in range(RADII) for j in range(i, RADII)]
     for i, j in Bar(nodes, desc="path costs", unit=f"x{YAWS} paths", shown=progress):
         for k in range(1 if i == j else 0, YAWS):  # no way at all: what is near it adds nothing to the string either
-            ends = _places(cell, middle, radii[i], radii[j], yaws[k])
-            excess[i, j, k] = excess[j, i, k] = _excess_mm(planner, *ends)
+            ends = _places(ring, middle, radii[i], radii[j], yaws[k])
+            excess[i, j, k] = excess[j, i, k] = _excess_mm(planner, arm, *ends)
     excess[np.isnan(excess)] = np.nanmax(excess)
-    distances = np.linspace(0.0, 2 * cell.r_max_mm, DISTANCES)
-    turns = 2 * np.arcsin(np.minimum(distances / (2 * cell.r_max_mm), math.sin(span / 2)))
-    chords = [_places(cell, middle, cell.r_max_mm, cell.r_max_mm, turn) for turn in turns]
-    string = np.array([planner.carrying(0, *ends, planner.home_rad)[0].lower_bound_mm for ends in chords])
-    return PathLengthTable(settings_key(cell, motion), np.array([cell.r_min_mm, cell.r_max_mm]), span, string, excess)
+    distances = np.linspace(0.0, 2 * ring.r_max_mm, DISTANCES)
+    turns = 2 * np.arcsin(np.minimum(distances / (2 * ring.r_max_mm), math.sin(span / 2)))
+    chords = [_places(ring, middle, ring.r_max_mm, ring.r_max_mm, turn) for turn in turns]
+    string = np.array([planner.carrying(arm, *ends, planner.others_home_rad(arm))[0].lower_bound_mm for ends in chords])
+    return PathLengthTable(settings_key(cell, motion, arm), np.array([ring.r_min_mm, ring.r_max_mm]), span, string, excess)
 
 
-def _places(cell: Cell, middle_rad: float, first_mm: float, second_mm: float, between_rad: float) -> tuple[Floats, Floats]:
-    """World positions (2,) of two places at these radii of the first arm, symmetric about ``middle_rad`` of its yaw."""
-    first, second = cell.bases[0].around((first_mm, second_mm), middle_rad + np.array([-0.5, 0.5]) * between_rad)
+def _places(ring: Arm, middle_rad: float, first_mm: float, second_mm: float, between_rad: float) -> tuple[Floats, Floats]:
+    """World positions (2,) of two places at these radii of an arm, symmetric about ``middle_rad`` of its yaw."""
+    first, second = ring.base.around((first_mm, second_mm), middle_rad + np.array([-0.5, 0.5]) * between_rad)
     return first, second
 
 
-def _excess_mm(planner: Any, pick_mm: Floats, place_mm: Floats) -> float:
+def _excess_mm(planner: Any, arm: int, pick_mm: Floats, place_mm: Floats) -> float:
     """What the shortest path found from all starts is longer than the string; NaN without a path."""
     from marl_handover.motion.path_optimizer import NoPath, find_path
 
     motion = planner.motion
-    segment, guesses = planner.carrying(0, pick_mm, place_mm, planner.home_rad)
+    segment, guesses = planner.carrying(arm, pick_mm, place_mm, planner.others_home_rad(arm))
     try:
         found = find_path(segment, guesses, motion.control_points, motion.degree, motion.num_initial_guesses, thorough=True)
     except NoPath:
@@ -260,9 +289,9 @@ def _found(key: str) -> PathLengthTable | None:
     return None
 
 
-def _kept(cell: Cell, motion: MotionConfig, key: str) -> PathLengthTable:
+def _kept(cell: Cell, motion: MotionConfig, key: str, arm: int) -> PathLengthTable:
     """A new table, kept in the cache folder if that can be written."""
-    table, path = build_table(cell, motion), cache_file(key)
+    table, path = build_table(cell, motion, arm), cache_file(key)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         table.save(path)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from marl_handover.compiled import compiled
 from marl_handover.motion.collision_model import MARGIN_MM, CollisionModel, Scene, ball_around, out_of_reach
-from marl_handover.motion.initial_guesses import fit_control_points, random_bend, smoothing_metric
+from marl_handover.motion.initial_guesses import fit_control_points, proportions, random_bend, smoothing_metric
 from marl_handover.motion.objective import LEVER_MM, ROUNDING_MM, Margins, Penalty, columns, dense_margins, lagrangian
 from marl_handover.motion.trajectory import NoPath, basis, sample_places, sampled_basis
 
@@ -279,7 +279,7 @@ class Segment:
             clearance=self.scene.clearance + margins_mm[1:3],
             profile=self.scene.profile + np.array([0, 0, 0, 0, 0, 0, margins_mm[3], margins_mm[4]]),
         )
-        spline = _spline(len(points), degree)
+        spline = _spline(len(points), degree, proportions(self.scene.planar).length_mm)
         metric = spline.metric * max(self.lower_bound_mm, SHORTEST_MM)
         spline = spline._replace(metric=metric, limits=self.collision_model.limits)
         x, _, evaluations = minimize(np.ascontiguousarray(points), spline, asked, WEIGHTS, options)
@@ -386,8 +386,8 @@ def _named(margins: Margins) -> str:
 
 
 @lru_cache(maxsize=16)
-def _spline(control_points: int, degree: int) -> Spline:
-    """The spline of a path of 1 mm, joint limits left open."""
+def _spline(control_points: int, degree: int, length_mm: float) -> Spline:
+    """The spline of a path of 1 mm of an arm of ``length_mm``, joint limits left open."""
     tau = sample_places(DESCENT_SAMPLES, CROWDING)
     B = np.ascontiguousarray(basis(tau, control_points, degree))
-    return Spline(B, np.diff(tau), smoothing_metric(control_points, degree), np.empty((4, 2)))
+    return Spline(B, np.diff(tau), smoothing_metric(control_points, degree, length_mm), np.empty((4, 2)))

@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
-from marl_handover.errors import InvalidSetting, NotFinite, WorkFailed
-from marl_handover.motion.collision_model import Scene, arm_collision_model, ball_around, standing_arm, standing_block
-from marl_handover.motion.initial_guesses import GRIP_LEAST_MM, SAMPLES, carrying_guesses, reaching_guesses
+from marl_handover.errors import InvalidSetting, NotFinite, UnequalArms, WorkFailed
+from marl_handover.motion.collision_model import CollisionModel, Scene, ball_around, collision_models, standing_arm, standing_block
+from marl_handover.motion.home import parked_poses
+from marl_handover.motion.initial_guesses import SAMPLES, carrying_guesses, proportions, reaching_guesses
 from marl_handover.motion.path_optimizer import FoundPath, Segment, find_path
 from marl_handover.motion.trajectory import OutOfArmsReach, PickPlacePaths, TransferMotion
 from marl_handover.progress import working
@@ -40,21 +41,44 @@ class MotionPlanner:
         model: the cell.
         motion: clearances, lift and limits.
 
+    Attributes:
+        homes_rad: (num_arms, 5) where each arm parks.
+        collision_models: each arm's shapes; arms of one robot share theirs.
+
     Raises:
-        InvalidSetting: on a setting out of its limits, or a parked pose the arm cannot take.
+        InvalidSetting: on a setting out of its limits, or a parked pose an arm cannot take.
     """
 
     def __init__(self, model: CellModel, motion: MotionConfig | None = None) -> None:
         self.model, self.motion = model, motion or MotionConfig()
         self.motion.validate()
         model.cell.require_grip(self.motion.finger_travel_mm)
-        self.home_rad = np.radians(np.asarray(self.motion.parked_deg, float))
-        if not model.arm.within_limits(self.home_rad):
-            raise InvalidSetting("motion.parked_deg", self.motion.parked_deg, "angles within the joint limits")
-        self.collision_model = arm_collision_model(model, self.motion)
+        self.homes_rad = parked_poses(model, self.motion)
+        self.collision_models = collision_models(model, self.motion)
         self.clearance_mm = np.array([self.motion.self_clearance_mm, self.motion.ground_clearance_mm])
         self._standing: tuple[tuple[int, bytes], Floats] = ((-1, b""), np.zeros((0, 9)))  # the last one asked for
-        self.pick_height_mm = float(model.cell.pick_height_mm)
+
+    @property
+    def home_rad(self) -> Floats:
+        """The parked pose (5,) that all arms have. Raises :class:`UnequalArms` where they differ, as the next one does."""
+        if (self.homes_rad != self.homes_rad[0]).any():
+            raise UnequalArms("parked pose", dict(zip(self.model.cell.names, np.degrees(self.homes_rad).round(3).tolist(), strict=True)))
+        return np.asarray(self.homes_rad[0])
+
+    @property
+    def collision_model(self) -> CollisionModel:
+        """The shapes that all arms have."""
+        _ = self.model.arm
+        return self.collision_models[0]
+
+    @property
+    def pick_height_mm(self) -> float:
+        """How high over the table all arms pick and place."""
+        return self.model.cell.pick_height_mm
+
+    def others_home_rad(self, arm: int) -> Floats:
+        """Where the other arms of ``arm`` park, in their order: (others, 5)."""
+        return np.delete(self.homes_rad, arm, axis=0)
 
     def pick_place(
         self, arm: int, pick_mm: ArrayLike, place_mm: ArrayLike, joints_rad: ArrayLike, other_joints_rad: ArrayLike
@@ -68,7 +92,8 @@ class MotionPlanner:
         """The motion with its phases."""
         from marl_handover.motion.pick_place import timed_phases
 
-        return replace(motion, phases=timed_phases(motion.paths, self.model.arm, self.motion, self.pick_height_mm))
+        height_mm = self.model.cell.pick_heights_mm[motion.arm]
+        return replace(motion, phases=timed_phases(motion.paths, self.model.arms[motion.arm], self.motion, height_mm))
 
     def plan_paths(
         self, arm: int, pick_mm: ArrayLike, place_mm: ArrayLike, joints_rad: ArrayLike, other_joints_rad: ArrayLike
@@ -96,7 +121,7 @@ class MotionPlanner:
         )
         transfer = self.transfer(arm, pick, place, other)
         approach = self.reach(arm, joints, pick, other, leaving=False)
-        retreat = self.reach(arm, self.home_rad, place, other, leaving=True)
+        retreat = self.reach(arm, self.homes_rad[arm], place, other, leaving=True)
         paths = PickPlacePaths(approach.points, transfer.points, retreat.points)
         clearance = min(found.margins.arm for found in (approach, transfer, retreat)) + self.motion.arm_clearance_mm
         spent = 1e3 * (time.perf_counter() - begun)
@@ -106,9 +131,10 @@ class MotionPlanner:
         """Plan and time one cycle, so that what is compiled on first use is; where that takes long, say so on stderr."""
         with working("compiling the motion kernels; once, they are cached"):
             cell = self.model.cell
-            pick, place = cell.bases[0].around((cell.r_min_mm + cell.r_max_mm) / 2, (-0.3, 0.3))
+            first = cell.arms[0]
+            pick, place = first.base.around((first.r_min_mm + first.r_max_mm) / 2, (-0.3, 0.3))
             with suppress(WorkFailed):  # settings under which nothing can move are for the first real command to name
-                self.pick_place(0, pick, place, self.home_rad, np.tile(self.home_rad, (cell.num_arms - 1, 1)))
+                self.pick_place(0, pick, place, self.homes_rad[0], self.others_home_rad(0))
 
     def transfer(self, arm: int, pick_mm: Floats, place_mm: Floats, other_joints_rad: Floats) -> FoundPath:
         """The path of the loaded hand from pick to place (world, mm). Raises as :meth:`plan_paths`."""
@@ -132,9 +158,10 @@ class MotionPlanner:
         profile = np.array([*ends_mm[0], *ends_mm[1], scale, scale, lift_mm, share * self.motion.ground_clearance_mm])
         others = self._other(arm, other_joints_rad)
         bound = string_length(distance, scale, lift_mm)
-        expected = bound + detour_length(ends_mm, GRIP_LEAST_MM)
-        segment = Segment(self.collision_model, self._scene(True, others, len(others), profile), ends, bound, expected)
-        return segment, carrying_guesses(self.collision_model, ends, ends_mm, self.pick_height_mm, lift_mm)
+        body, height_mm = self.collision_models[arm], self.model.cell.pick_heights_mm[arm]
+        expected = bound + detour_length(ends_mm, proportions(body.planar).grip_least_mm)
+        segment = Segment(body, self._scene(arm, True, others, len(others), profile), ends, bound, expected)
+        return segment, carrying_guesses(body, ends, ends_mm, height_mm, lift_mm)
 
     def reach(self, arm: int, joints_rad: Floats, pin_mm: Floats, other_joints_rad: Floats, *, leaving: bool) -> FoundPath:
         """The path of the empty hand from ``joints_rad`` to the pin, or, ``leaving``, from it to them. Raises as :meth:`plan_paths`."""
@@ -145,7 +172,7 @@ class MotionPlanner:
         self, arm: int, joints_rad: Floats, pin_mm: Floats, other_joints_rad: Floats, *, leaving: bool
     ) -> tuple[Segment, Iterator[Floats]]:
         """The segment of :meth:`reach` and its first guesses."""
-        if abs(joints_rad[4]) > 1e-6 or not self.model.arm.within_limits(joints_rad):
+        if abs(joints_rad[4]) > 1e-6 or not self.model.arms[arm].within_limits(joints_rad):
             raise InvalidSetting("joints_rad", np.round(joints_rad, 4).tolist(), "within the joint limits, with wrist roll 0")
         pin = self.in_base(arm, pin_mm)
         grasp = self.grasp_joints(arm, "place" if leaving else "pick up", pin_mm)
@@ -155,23 +182,20 @@ class MotionPlanner:
         profile = np.array([*pin, *pin, *scales, self.motion.lift_mm, self.motion.ground_clearance_mm])
         others = self._other(arm, other_joints_rad)
         obstacles = np.concatenate([others, standing_block(self.model, self.motion, pin)])
-        segment = Segment(self.collision_model, self._scene(False, obstacles, len(others), profile), ends, 0.0, 0.0)
-        return segment, reaching_guesses(
-            self.collision_model, ends, np.array([*pin, self.pick_height_mm]), self.motion.lift_mm, not leaving
-        )
+        body, pin_mm = self.collision_models[arm], np.array([*pin, self.model.cell.pick_heights_mm[arm]])
+        segment = Segment(body, self._scene(arm, False, obstacles, len(others), profile), ends, 0.0, 0.0)
+        return segment, reaching_guesses(body, ends, pin_mm, self.motion.lift_mm, not leaving)
 
     def grasp_joints(self, arm: int, what: str, position_mm: Floats) -> Floats:
         """Joints (5,) that hold the pin at a world position (2,) with pitch = roll = 0. Raises :class:`OutOfArmsReach`."""
         return grasp_joints(self.model, arm, what, position_mm)
 
-    def _scene(self, holding: bool, obstacles: Floats, arm_rows: int, profile: Floats) -> Scene:
-        """The arm, empty or with the block, among obstacles."""
-        body = self.collision_model
+    def _scene(self, arm: int, holding: bool, obstacles: Floats, arm_rows: int, profile: Floats) -> Scene:
+        """An arm, empty or with the block, among obstacles."""
+        body, height_mm = self.collision_models[arm], self.model.cell.pick_heights_mm[arm]
         capsules, pairs, edges = (body.held, body.held_pairs, body.edges) if holding else (body.capsules, body.pairs, body.edges[:0])
         carried, group = len(body.capsules), ball_around(obstacles)
-        return Scene(
-            body.planar, capsules, carried, pairs, obstacles, arm_rows, group, self.clearance_mm, self.pick_height_mm, edges, profile
-        )
+        return Scene(body.planar, capsules, carried, pairs, obstacles, arm_rows, group, self.clearance_mm, height_mm, edges, profile)
 
     def in_base(self, arm: int, position_mm: Floats) -> Floats:
         """A world position (2,) in the frame of an arm's base."""
@@ -188,7 +212,8 @@ class MotionPlanner:
             base = bases[index]
             turn = base.facing_rad - bases[arm].facing_rad
             x_mm, y_mm = self.in_base(arm, base.position_mm)
-            rows.append(standing_arm(self.collision_model, self.model.arm, self.motion, its_rad, float(x_mm), float(y_mm), turn))
+            body, kinematics = self.collision_models[index], self.model.arms[index]
+            rows.append(standing_arm(body, kinematics, self.motion, its_rad, float(x_mm), float(y_mm), turn))
         self._standing = (key, np.concatenate(rows))
         return self._standing[1]
 
@@ -244,9 +269,9 @@ def grasp_joints(model: CellModel, arm: int, what: str, position_mm: Floats) -> 
     Raises:
         OutOfArmsReach: no joint vector within the limits does it.
     """
-    base, arm_model = model.cell.bases[arm], model.arm
+    base, arm_model = model.cell.bases[arm], model.arms[arm]
     x, y = base.to_local(position_mm)
-    q = arm_model.ik(np.array([x, y, model.cell.pick_height_mm]))
+    q = arm_model.ik(np.array([x, y, model.cell.pick_heights_mm[arm]]))
     inside = np.clip(q, arm_model.lower_rad, arm_model.upper_rad)
     good = (np.abs(q - inside) <= EDGE_RAD).all(axis=-1)  # NaN, out of reach, is not
     if not good.any():

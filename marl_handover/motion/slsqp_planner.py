@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from marl_handover.compiled import compiled
-from marl_handover.geometry.closed_form import grip_in_plane, grip_speed
+from marl_handover.geometry.closed_form import grip_in_plane, grip_speed, out_of_plane
 from marl_handover.geometry.kernels import elbow_up
 from marl_handover.motion.collision_model import Scene
 from marl_handover.motion.objective import dense_margins
@@ -119,7 +119,7 @@ def _pose_errors(segment: Segment, points: Floats) -> Floats:
 
     def poses(q: Floats) -> Floats:
         r, z = grip_in_plane(segment.scene.planar, q)
-        return np.stack([r * np.cos(q[:, 0]), r * np.sin(q[:, 0]), z, q[:, 1:4].sum(axis=1)], axis=1)
+        return np.stack([*out_of_plane(segment.scene.planar, r, q[:, 0]), z, q[:, 1:4].sum(axis=1)], axis=1)
 
     ends = points[[0, -1]]
     return np.concatenate([poses(ends) - poses(segment.ends), ends[:, 4:]], axis=1)

@@ -273,8 +273,9 @@ class CellPainter:
             shapes += block_shapes(self._block, np.asarray(T_world_block), self._eye, self._top)
         if joints_rad is not None:
             grippers = gripper_mm or [None] * self.model.cell.num_arms
-            for base, joints, opened in zip(self.model.cell.bases, np.asarray(joints_rad), grippers, strict=True):
-                shapes += arm_shapes(self.model.arm, base, joints, opened)
+            model = self.model
+            for arm, base, joints, opened in zip(model.arms, model.cell.bases, np.asarray(joints_rad), grippers, strict=True):
+                shapes += arm_shapes(arm, base, joints, opened)
         return self.renderer.picture(shapes)
 
 

@@ -159,7 +159,7 @@ def _numbered(motions: Sequence[TransferMotion]) -> list[tuple[Floats, list[str]
 
 def _draw_side(axes: Axes, motions: Sequence[TransferMotion], model: CellModel) -> None:
     axes.axhline(0.0, color=INK, linewidth=1.2)
-    height = model.cell.pick_height_mm
+    height = min(model.cell.pick_heights_mm)
     axes.axhline(height, color=GREY, linewidth=0.7, linestyle=":")
     axes.annotate("pick height", (1.0, height), xycoords=("axes fraction", "data"), xytext=(-3, 3), textcoords="offset points", fontsize=8,
                   color=GREY, ha="right")  # fmt: skip
@@ -252,10 +252,11 @@ def plan_motions(planner: MotionPlanner, transfers: Iterable[tuple[int, Floats, 
     Raises:
         NoMotion: if one of them is not possible.
     """
-    parked, motions = planner.home_rad, []
+    motions = []
     for number, (arm, start, end) in enumerate(transfers, start=1):
         try:
-            motions.append(planner.pick_place(arm, start, end, parked, parked))
+            others = planner.others_home_rad(arm)
+            motions.append(planner.pick_place(arm, start, end, planner.homes_rad[arm], others[0] if len(others) == 1 else others))
         except WorkFailed as failure:
             raise NoMotion(number, ARM_LETTERS[arm], str(failure)) from failure
     return motions
@@ -278,7 +279,7 @@ def motion_row(motion: TransferMotion) -> dict[str, Any]:
 
 def grip_mm(model: CellModel, arm: int, joints_rad: Floats) -> Floats:
     """World position (..., 3) of an arm's grip."""
-    return model.cell.bases[arm].to_world(model.arm.grip_mm(joints_rad))
+    return model.cell.bases[arm].to_world(model.arms[arm].grip_mm(joints_rad))
 
 
 def clearances_mm(model: CellModel, settings: MotionConfig, motion: TransferMotion) -> tuple[Floats, Floats]:
@@ -292,7 +293,7 @@ def clearances_mm(model: CellModel, settings: MotionConfig, motion: TransferMoti
     for phase in motion.phases:
         own = _capsules(model, settings, motion.arm, phase.joints_rad, phase.name in LOADED_PHASES)
         to_arm.append(_least_gap(own, other))
-        to_table.append(ground_clearance_mm(model.arm, phase.joints_rad))
+        to_table.append(ground_clearance_mm(model.arms[motion.arm], phase.joints_rad))
     return np.concatenate(to_arm), np.concatenate(to_table)
 
 
@@ -301,11 +302,12 @@ _Shapes = Sequence[tuple[Floats, Floats, float]]
 
 
 def _capsules(model: CellModel, settings: MotionConfig, arm: int, joints_rad: Floats, holding: bool) -> _Shapes:
-    frames = model.arm.link_transforms(joints_rad, settings.finger_travel_mm)
-    pieces: list[tuple[Floats, Capsule]] = [(frames[capsule.link], capsule) for capsule in capsule_pairs(model.arm.description)[0]]
+    kinematics = model.arms[arm]
+    frames = kinematics.link_transforms(joints_rad, settings.finger_travel_mm)
+    pieces: list[tuple[Floats, Capsule]] = [(frames[capsule.link], capsule) for capsule in capsule_pairs(kinematics.description)[0]]
     if holding:
         config = model.cell.config
-        pieces += [(model.arm.fk(joints_rad), capsule) for capsule in block_capsules(config.block, model.cell.pick_height_mm)]
+        pieces += [(kinematics.fk(joints_rad), capsule) for capsule in block_capsules(config.block, model.cell.pick_heights_mm[arm])]
     world = model.cell.bases[arm].to_world
     return [(world(apply(T, c.start_mm)), world(apply(T, c.end_mm)), c.radius_mm) for T, c in pieces]
 

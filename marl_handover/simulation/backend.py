@@ -73,7 +73,7 @@ class BulletBackend:
         refusal = self.check(arm, paths, self.joints_rad()[arm], self.cell.object_pose()[:2])
         if refusal is not None:
             return Execution(self.cell.object_pose(), self.joints_rad(), 0.0, refusal)
-        return self.carry_out(arm, timed_phases(welded(paths), self.model.arm, self.motion, self.model.cell.pick_height_mm))
+        return self.carry_out(arm, timed_phases(welded(paths), self.model.arms[arm], self.motion, self.model.cell.pick_heights_mm[arm]))
 
     def carry_out(self, arm: int, phases: tuple[Phase, ...]) -> Execution:
         """The same for a cycle that is timed already, and taken as it is."""

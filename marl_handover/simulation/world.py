@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from marl_handover.cell.build import CellModel
 from marl_handover.config import BlockConfig, MotionConfig, require_choice
+from marl_handover.motion.home import parked_poses
 from marl_handover.motion.trajectory import Phase
 from marl_handover.simulation.arm import SERVO_S, SimulatedArm
 from marl_handover.simulation.camera import TOP, Camera, Pixels, picture
@@ -246,7 +247,7 @@ class BulletCell:
         require_choice("grasp", grasp, GRASPS)
         model.cell.require_grip(motion.finger_travel_mm)
         self.model, self.motion, self.grasp = model, motion, grasp
-        self.home_rad = np.radians(motion.parked_deg)
+        self.homes_rad = parked_poses(model, motion)
         self.engine = Engine(gui)
         self.reset((0.0, 0.0, 0.0))
 
@@ -264,12 +265,12 @@ class BulletCell:
         """Both arms parked with open fingers, the block standing at ``pose`` (3,): x_mm, y_mm, theta_rad; settled, at time 0."""
         self.engine.clear()
         self._table = _table(self.engine)
-        self.arms = [SimulatedArm(self.engine, self.model.arm, base) for base in self.model.cell.bases]
+        self.arms = [SimulatedArm(self.engine, arm, base) for arm, base in zip(self.model.arms, self.model.cell.bases, strict=True)]
         self.block = Block(self.engine, self.model.cell.config.block)
         self._bonds: dict[int, int] = {}
         self._holding: set[int] = set()
-        for arm in self.arms:
-            arm.place(self.home_rad, self.motion.finger_travel_mm)
+        for arm, home_rad in zip(self.arms, self.homes_rad, strict=True):
+            arm.place(home_rad, self.motion.finger_travel_mm)
         self.block.place(np.asarray(pose, dtype=float))
         self.settle()
         self.engine.time_s = 0.0

@@ -345,7 +345,7 @@ class LivePage:
         if holder is not None:
             base = model.cell.bases[holder]
             T_world_base = base.matrix()
-            now = T_world_base @ model.arm.fk(np.array(state["arms"][holder]["joints_rad"], float))
+            now = T_world_base @ model.arms[holder].fk(np.array(state["arms"][holder]["joints_rad"], float))
             self._held = now @ np.linalg.inv(_picking(model.cell, holder, pose)) @ flat_pose(*pose)
             return self._held
         if state["phase"] in _PUT_DOWN and state["doing"] == "moving":

@@ -115,7 +115,7 @@ class ArmNodes:
     """
 
     def __init__(self, server: viser.ViserServer, model: CellModel, index: int) -> None:
-        self.description, base = model.arm.description, model.cell.bases[index]
+        self.description, base = model.arms[index].description, model.cell.bases[index]
         self.names = {self.description.root: f"/arm_{index}"}
         yaw = quaternion(UPWARDS, base.facing_rad)
         server.scene.add_frame(self.names[self.description.root], show_axes=False, wxyz=yaw, position=metres([base.x_mm, base.y_mm, 0.0]))

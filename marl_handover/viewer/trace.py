@@ -82,7 +82,7 @@ class Motions:
 
     def placed(self, step: Step) -> Floats:
         """Joints (n, 5) of the arms as a transfer ends: the one holds what it has put down, if it has; the others are parked."""
-        joints = np.tile(self.planner.home_rad, (self.model.cell.num_arms, 1))
+        joints = self.planner.homes_rad.copy()
         if not step.trouble:
             with suppress(HandoverError):  # put down beyond what exact arms reach
                 joints[step.arm] = grasp_joints(self.model, step.arm, "place", step.next_state[:2])
@@ -97,13 +97,14 @@ class Motions:
         return self._straight(step)
 
     def _planned(self, step: Step) -> Motion:
-        parked = self.planner.home_rad
-        planned = self.planner.pick_place(step.arm, step.state[:2], step.next_state[:2], parked, parked)
+        planner = self.planner
+        own_rad, others_rad = planner.homes_rad[step.arm], planner.others_home_rad(step.arm)
+        planned = planner.pick_place(step.arm, step.state[:2], step.next_state[:2], own_rad, others_rad)
         names = [phase.name for phase in planned.phases for _ in phase.t_s]
         own = np.concatenate([phase.joints_rad for phase in planned.phases])
         held = np.array([name in LOADED_PHASES for name in names])
-        opened = np.concatenate([phase.gripper_mm for phase in planned.phases]) > self.planner.motion.finger_travel_mm / 2
-        joints = np.tile(parked, (len(own), self.model.cell.num_arms, 1))
+        opened = np.concatenate([phase.gripper_mm for phase in planned.phases]) > planner.motion.finger_travel_mm / 2
+        joints = np.tile(planner.homes_rad, (len(own), 1, 1))
         joints[:, step.arm] = own
         grips = np.ones((len(own), self.model.cell.num_arms), bool)
         grips[:, step.arm] = opened
@@ -121,7 +122,7 @@ class Motions:
         share = np.linspace(0.0, 1.0, _STRAIGHT_SAMPLES)
         turn = np.angle(np.exp(1j * (step.next_state[2] - step.state[2])))
         poses = step.state + share[:, None] * np.array([*(step.next_state[:2] - step.state[:2]), turn])
-        joints = np.tile(self.planner.home_rad, (len(share), self.model.cell.num_arms, 1))
+        joints = np.tile(self.planner.homes_rad, (len(share), 1, 1))
         grips = np.ones(joints.shape[:2], bool)
         return Motion(STRAIGHT_S * share, joints, grips, np.stack([lying(pose) for pose in poses]))
 
@@ -132,7 +133,7 @@ class Motions:
         first = int(inside[0]) if len(inside) else len(own)
         T[: min(first, len(own) - 1)] = lying(step.state)
         if len(inside):
-            T_world_grip = self.model.cell.bases[step.arm].matrix() @ self.model.arm.fk(own)
+            T_world_grip = self.model.cell.bases[step.arm].matrix() @ self.model.arms[step.arm].fk(own)
             T[held] = T_world_grip[held] @ np.linalg.inv(T_world_grip[first]) @ lying(step.state)
         return T
 
@@ -249,7 +250,7 @@ class TracePage:
 
     def _park(self) -> None:
         arms = self.scene.model.cell.num_arms
-        self.scene.show_joints(np.tile(self.motions.planner.home_rad, (arms, 1)), [True] * arms)
+        self.scene.show_joints(self.motions.planner.homes_rad, [True] * arms)
 
     def _play_on(self, dt_s: float) -> None:
         """The next piece of the motion from this moment to the next."""

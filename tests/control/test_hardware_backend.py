@@ -316,7 +316,7 @@ def test_what_the_gate_refuses_is_not_sent_and_the_arm_goes_home(start):
     assert not episode.solved
     assert workcell.counts[Event.GATE_REFUSED] >= 1
     assert math.dist(workcell.twin.true_pose()[:2], START[:2]) < 1.0
-    assert np.degrees(np.abs(workcell.twin.true_joints_rad() - workcell.session.backend.check.home_rad)).max() < 6.0
+    assert np.degrees(np.abs(workcell.twin.true_joints_rad() - workcell.session.backend.check.homes_rad)).max() < 6.0
 
 
 def test_the_latched_stop_ends_the_session_where_it_is(start, tmp_path):

@@ -131,10 +131,10 @@ class Clumsy(FreePaths):
         super().__init__(planner)
         self.random, self.share = np.random.default_rng(seed), share
 
-    def timed(self, found):
+    def timed(self, arm, found):
         if self.random.random() < self.share:
             raise NoPath("path", "nothing", 1.0, 0)
-        return super().timed(found)
+        return super().timed(arm, found)
 
 
 def test_where_no_way_is_found_the_block_is_left_standing_and_the_next_change_is_taken_up(model, planner):

@@ -27,7 +27,7 @@ def on_table(paths, arm, place):
 
 
 def stop_of(paths, track, share):
-    return stopped(track, share * track.duration_s, paths.acceleration_rad_s2).end_rad
+    return stopped(track, share * track.duration_s, paths.limits[0][1]).end_rad
 
 
 def check(paths, arm, track, start, pin_mm=None):
@@ -35,11 +35,11 @@ def check(paths, arm, track, start, pin_mm=None):
     model = paths.planner.model
     assert np.allclose(track.joints_rad[0], start, atol=1e-9)
     assert not track.velocities_rad_s[[0, -1]].any()
-    assert (abs(track.velocities_rad_s) <= paths.velocity_rad_s * 1.001).all()
+    assert (abs(track.velocities_rad_s) <= paths.limits[0][0] * 1.001).all()
     grip = model.arm.fk(track.joints_rad)[:, :3, 3]
     assert grip[:, 2].min() >= model.cell.pick_height_mm - 0.05
     if pin_mm is None:
-        assert paths.parked(track.end_rad)
+        assert paths.parked(arm, track.end_rad)
     else:
         assert np.allclose(grip[-1, :2], model.cell.bases[arm].to_local(pin_mm), atol=0.02)
 
@@ -49,8 +49,8 @@ def check(paths, arm, track, start, pin_mm=None):
 def test_an_empty_hand_that_stopped_finds_its_way(paths, old, new, other, share, arm):
     """To another pin, and home, past the block wherever it is, unless it is where the hand is."""
     pins = [on_table(paths, arm, place) for place in (old, new)]
-    approach = paths.to_pin(arm, paths.home_rad, pins[0])
-    check(paths, arm, approach, paths.home_rad, pins[0])
+    approach = paths.to_pin(arm, paths.homes_rad[0], pins[0])
+    check(paths, arm, approach, paths.homes_rad[0], pins[0])
     here = stop_of(paths, approach, share)
     if paths.clear_of_block(arm, here[None], pins[1]):
         onward = paths.to_pin(arm, here, pins[1])
@@ -76,7 +76,7 @@ def test_a_block_in_mid_air_can_go_elsewhere(paths, pick, old, new, share, arm):
 def test_who_is_there_stays_there(paths):
     pick, place = on_table(paths, 0, (190.0, -20.0)), on_table(paths, 0, (190.0, 20.0))
     there = paths.carry(0, pick, place).end_rad
-    for start, track in ((paths.home_rad, paths.home(0, paths.home_rad, pick)), (there, paths.carry_on(0, there, place))):
+    for start, track in ((paths.homes_rad[0], paths.home(0, paths.homes_rad[0], pick)), (there, paths.carry_on(0, there, place))):
         assert np.array_equal(track.end_rad, start)
         assert track.duration_s < 0.01
 
@@ -84,8 +84,8 @@ def test_who_is_there_stays_there(paths):
 def test_where_there_is_no_way_that_is_said_by_name(paths):
     pick, place = on_table(paths, 0, (190.0, -20.0)), on_table(paths, 0, (190.0, 20.0))
     with pytest.raises(OutOfArmsReach):
-        paths.to_pin(0, paths.home_rad, on_table(paths, 0, (260.0, 0.0)))
-    grasp = paths.to_pin(0, paths.home_rad, pick).end_rad
+        paths.to_pin(0, paths.homes_rad[0], on_table(paths, 0, (260.0, 0.0)))
+    grasp = paths.to_pin(0, paths.homes_rad[0], pick).end_rad
     with pytest.raises(OutOfArmsReach):
         paths.carry_on(0, grasp, on_table(paths, 1, (150.0, 0.0)) * 3)
     with pytest.raises(NoPath, match="start"):
@@ -94,7 +94,7 @@ def test_where_there_is_no_way_that_is_said_by_name(paths):
 
 def test_a_hand_is_not_clear_of_a_block_that_it_stands_in(paths):
     pin = on_table(paths, 0, (190.0, 10.0))
-    grasp = paths.to_pin(0, paths.home_rad, pin).end_rad[None]
+    grasp = paths.to_pin(0, paths.homes_rad[0], pin).end_rad[None]
     assert paths.clear_of_block(0, grasp, pin)
     around = [pin + 20 * np.array([math.cos(angle), math.sin(angle)]) for angle in np.linspace(0, 6, 24)]
     assert not all(paths.clear_of_block(0, grasp, block) for block in around)

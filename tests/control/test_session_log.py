@@ -36,7 +36,7 @@ def test_a_disk_that_fills_up_while_an_arm_moves_ends_the_session_when_it_is_par
                 session.play(START, GivenGoal(FAR))
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, usual)
-        np.testing.assert_allclose(loop.backend.joints_rad(), np.tile(loop.backend.check.home_rad, (2, 1)), atol=1e-6)
+        np.testing.assert_allclose(loop.backend.joints_rad(), loop.backend.check.homes_rad, atol=1e-6)
     assert full.value.exit_status == 1
     assert moved.count("motion") == 1, "no second one began"
     assert moved.index("motion") < moved.index("transfer") or "ended" in moved, "the first one was played to its end"

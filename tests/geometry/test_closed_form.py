@@ -16,7 +16,7 @@ from marl_handover.arrays import wrap
 from marl_handover.errors import InvalidSetting, UnknownKey, UnsupportedKinematics
 from marl_handover.files import resource_path
 from marl_handover.geometry.arm_model import ArmModel
-from marl_handover.geometry.closed_form import ClosedFormArm, grip_in_plane, grip_speed, planar_ik
+from marl_handover.geometry.closed_form import ClosedFormArm, grip_in_plane, grip_speed, into_plane, out_of_plane, planar_ik
 from marl_handover.geometry.se3 import rotation, transform
 from marl_handover.geometry.urdf import ARM_JOINTS, ArmDescription, read_urdf
 
@@ -37,6 +37,7 @@ def moved(description: ArmDescription, **shifts_mm: tuple[float, float, float]) 
 # Upward offsets in every link, as a real bracket has them.
 BENT = moved(DESCRIPTION, shoulder=(-3, 0, 9), elbow=(2, 0, 11), wrist_pitch=(0, 0, -7), wrist_roll=(0, 0, 5), grasp=(4, 0, 0))
 ARMS = [ClosedFormArm(DESCRIPTION, WIDE), ClosedFormArm(BENT, WIDE)]
+ASIDE = [ClosedFormArm(moved(BENT, grasp=(0, side, 0)), WIDE) for side in (-12.0, 30.0)]
 angle = st.floats(-3.1, 3.1)
 
 
@@ -55,6 +56,32 @@ def test_fk_of_ik_is_identity_on_both_branches(arm: ArmModel, yaw: float, should
     np.testing.assert_allclose(arm.fk(back), np.broadcast_to(T_base_grip, (2, 4, 4)), atol=1e-5)
     same = np.abs(wrap(back - q)).max(axis=-1)
     assert same.min() < 1e-5  # acos near a stretched elbow costs half the digits
+
+
+@pytest.mark.parametrize("arm", ASIDE, ids=["right", "left"])
+@settings(max_examples=150, deadline=None)
+@given(yaw=angle, shoulder=angle, elbow=angle, pitch=angle)
+def test_a_grip_beside_the_plane_is_turned_less_than_its_place_is_seen(
+    arm: ClosedFormArm, yaw: float, shoulder: float, elbow: float, pitch: float
+) -> None:
+    """psi = atan2(y, x) - asin(offset / distance), in fk, ik, the plane and speeds alike; nearer than the offset there is no pose."""
+    q = np.array([yaw, shoulder, elbow, wrap(pitch - shoulder - elbow), 0.0])
+    T_base_grip = arm.fk(q)
+    x, y, _ = T_base_grip[:3, 3]
+    np.testing.assert_allclose(arm.grip_mm(q), T_base_grip[:3, 3], atol=1e-9)
+    rates = np.array([0.3, -0.7, 0.2, 1.1, 0.0])
+    assert float(grip_speed(arm.planar, q, rates)) == pytest.approx(np.linalg.norm(arm.jacobian(q)[:3] @ rates), abs=1e-9)
+    r, _ = grip_in_plane(arm.planar, q)
+    np.testing.assert_allclose(out_of_plane(arm.planar, r, q[0]), (x, y), atol=1e-9)
+    assume(r > 1.0)
+    distance = math.hypot(x, y)
+    radius, turned = into_plane(arm.planar, torch.tensor(distance, dtype=torch.float64), torch.atan2(torch.tensor(y), torch.tensor(x)))
+    assert float(radius) == pytest.approx(float(r), abs=1e-6)
+    assert abs(wrap(float(turned) - yaw)) < 1e-6
+    assert abs(wrap(math.atan2(y, x) - math.asin(arm.lateral_mm / distance) - yaw)) < 1e-6
+    back = arm.ik(T_base_grip[:3, 3], pitch)
+    np.testing.assert_allclose(arm.fk(back), np.broadcast_to(T_base_grip, (2, 4, 4)), atol=1e-5)
+    assert np.isnan(arm.ik([0.9 * arm.lateral_mm, 0.0, 50.0])).all()
 
 
 def test_branch_0_is_elbow_up() -> None:

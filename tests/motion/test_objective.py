@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from marl_handover.cell.build import build_cell
+from marl_handover.config import MotionConfig
 from marl_handover.geometry.capsules import segment_distance
 from marl_handover.motion.initial_guesses import fit_control_points
-from marl_handover.motion.objective import Penalty, columns, lagrangian, ramp
+from marl_handover.motion.objective import Penalty, columns, first_moving, lagrangian, ramp
 from marl_handover.motion.path_optimizer import WEIGHTS
+from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import evaluate
+from tests.canonical_arms import SO101
 from tests.geometry.test_kernels import placed
 
 OTHER = np.array([0.3, 1.0, -2.2, 1.2, 0.0])
 
 
-@pytest.fixture(params=["carrying", "reaching", "leaving"])
-def case(request, planner):
+@pytest.fixture(scope="module")
+def aside(tmp_path_factory):
+    """The planner of two arms whose grips lie beside their planes, their hands pointing down."""
+    cell = replace(SO101, lateral=-25.0).cell(tmp_path_factory.mktemp("aside"), grid_mm=10.0, base_distance_mm=360.0)
+    return MotionPlanner(build_cell(cell), MotionConfig(parked_deg=[0, 120, -150, 100, 0]))
+
+
+@pytest.fixture(params=["carrying", "reaching", "leaving", "carrying aside", "reaching aside"])
+def case(request, planner, aside):
     """A segment and joint samples of a rough guess, some of them in collision."""
     pick, place = np.array([-120.0, 40.0]), np.array([150.0, 60.0])
-    if request.param == "carrying":
+    planner = aside if request.param.endswith("aside") else planner
+    if request.param.startswith("carrying"):
         segment, guesses = planner.carrying(0, pick, place, OTHER)
         guess = next(guesses)
     else:
@@ -59,6 +73,7 @@ def test_the_dense_check_is_the_brute_force_minimum(case):
     segment, Q = case
     scene = segment.scene
     margins, length = segment.check(Q)
+    first, aside = first_moving(scene.capsules), scene.planar[8]
     arm, block, itself, ground = [], [], [], []
     grips = []
     for q in Q:
@@ -68,18 +83,18 @@ def test_the_dense_check_is_the_brute_force_minimum(case):
         turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
         for number, row in enumerate(scene.obstacles):
             a, b = turn @ row[:3], turn @ row[3:6]
-            for k in range(3, len(ends)):
+            for k in range(first, len(ends)):
                 gap = segment_distance(ends[k, :3], ends[k, 3:6], a, b) - row[6] - row[7] - scene.capsules[k, 7]
                 (arm if number < scene.arm_rows else block).append(gap)
         for i, j in scene.pairs:
             gap = segment_distance(ends[i, :3], ends[i, 3:6], ends[j, :3], ends[j, 3:6])
             itself.append(gap - scene.capsules[i, 7] - scene.capsules[j, 7] - scene.clearance[0])
-        for k in range(3, scene.carried):
+        for k in range(first, scene.carried):
             ground.append(min(ends[k, 2], ends[k, 5]) - scene.capsules[k, 7] - scene.clearance[1])
         tool = scene.planar[6:8]
         r = frames[0, 4, 0] + frames[0, 4, 2] * tool[0] - frames[0, 4, 3] * tool[1]
         z = frames[0, 4, 1] + frames[0, 4, 3] * tool[0] + frames[0, 4, 2] * tool[1]
-        grips.append([r * c, r * s, z])
+        grips.append([r * c - aside * s, r * s + aside * c, z])
     assert margins.arm == pytest.approx(min(arm), abs=1e-9)
     assert margins.itself == pytest.approx(min(itself), abs=1e-9)
     assert margins.ground == pytest.approx(min(ground), abs=1e-9)

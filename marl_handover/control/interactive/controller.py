@@ -135,7 +135,7 @@ class InteractiveController:
 
     def __init__(self, adapter: PolicyAdapter, model: CellModel, planner: MotionPlanner, seed: int) -> None:
         self.adapter, self.programs = adapter, MotionPrograms(FreePaths(planner))
-        self.world, self.score = WorldState(model, planner.home_rad, np.zeros(3)), Score()
+        self.world, self.score = WorldState(model, planner.homes_rad, np.zeros(3)), Score()
         self.goal, self.ended, self.message = np.zeros(3), "", ""
         self.plan: tuple[Placement, ...] = ()
         self.transfers, self.optimal = 0, 0
@@ -167,7 +167,7 @@ class InteractiveController:
         world, paths = self.world, self.programs.paths
         for arm, joints in enumerate(world.joints_rad):
             samples = self.programs.stop(world).joints_rad if arm == world.arm else joints[None]
-            if not (paths.parked(joints) or paths.clear_of_block(arm, samples, block[:2])):
+            if not (paths.parked(arm, joints) or paths.clear_of_block(arm, samples, block[:2])):
                 self.message = f"arm {ARM_LETTERS[arm]} is in the way there"
                 return False
         self.message = f"block taken from the hand of {ARM_LETTERS[world.arm]}" if world.held else "block moved"
@@ -196,7 +196,7 @@ class InteractiveController:
         """Nothing moves: the next transfer, if there is one."""
         world, paths = self.world, self.programs.paths
         self._command = self._next_command(world.pose, self._previous)
-        program = [self.programs.home(arm, q, world.pose) for arm, q in enumerate(world.joints_rad) if not paths.parked(q)]
+        program = [self.programs.home(arm, q, world.pose) for arm, q in enumerate(world.joints_rad) if not paths.parked(arm, q)]
         if self._command is not None:
             program += self.programs.cycle(self._command, world.pose)
         world.start(program)

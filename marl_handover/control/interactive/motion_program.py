@@ -18,7 +18,7 @@ from marl_handover.control.interactive.world_state import MotionSegment, WorldSt
 from marl_handover.control.transfers import TransferCommand
 from marl_handover.errors import WorkFailed
 from marl_handover.motion.collision_model import ball_around, standing_block
-from marl_handover.motion.initial_guesses import GRIP_LEAST_MM, SAMPLES, carrying_guesses, reaching_guesses
+from marl_handover.motion.initial_guesses import SAMPLES, carrying_guesses, proportions, reaching_guesses
 from marl_handover.motion.path_optimizer import FoundPath, Segment, find_path
 from marl_handover.motion.pick_place import motion_limits
 from marl_handover.motion.planner import STILL_MM, MotionPlanner, detour_length, string_length
@@ -137,50 +137,50 @@ class FreePaths:
     """
 
     def __init__(self, planner: MotionPlanner) -> None:
-        self.planner, self.motion, self.collision_model = planner, planner.motion, planner.collision_model
-        model = planner.model
-        self.home_rad = planner.home_rad
+        self.planner, self.motion, self.homes_rad = planner, planner.motion, planner.homes_rad
         self.planned = 0
-        self.velocity_rad_s, self.acceleration_rad_s2 = motion_limits(model.arm, self.motion)
-        middle = (model.cell.r_min_mm + model.cell.r_max_mm) / 2
+        self.limits = tuple(motion_limits(arm, self.motion) for arm in planner.model.arms)
+        """Velocity and acceleration limits (5,) of each arm, in rad/s and rad/s^2."""
         self._empty, self._loaded = [], []
-        for arm, base in enumerate(model.cell.bases):
-            ahead = base.to_world([middle, 0.0])
-            self._empty.append(planner.reaching(arm, self.home_rad, ahead, self.home_rad, leaving=True)[0])
-            self._loaded.append(planner.carrying(arm, ahead, ahead, self.home_rad)[0])
+        for index, arm in enumerate(planner.model.cell.arms):
+            ahead, others = arm.base.to_world([(arm.r_min_mm + arm.r_max_mm) / 2, 0.0]), planner.others_home_rad(index)
+            self._empty.append(planner.reaching(index, self.homes_rad[index], ahead, others, leaving=True)[0])
+            self._loaded.append(planner.carrying(index, ahead, ahead, others)[0])
 
-    def parked(self, joints_rad: Floats) -> bool:
+    def parked(self, arm: int, joints_rad: Floats) -> bool:
         """Whether an arm at ``joints_rad`` (5,) is parked."""
-        return self._same(joints_rad, self.home_rad)
+        return self._same(joints_rad, self.homes_rad[arm])
 
     def to_pin(self, arm: int, joints_rad: Floats, pin_mm: Floats) -> JointTrajectory:
         """The empty hand from ``joints_rad`` (5,) to the pin of a block lying at ``pin_mm`` (2,). Raises as ``MotionPlanner.cycle``."""
-        if self.parked(joints_rad):
-            return self.timed(self.planner.reach(arm, joints_rad, pin_mm, self.home_rad, leaving=False))
+        if self.parked(arm, joints_rad):
+            return self.timed(arm, self.planner.reach(arm, joints_rad, pin_mm, self.planner.others_home_rad(arm), leaving=False))
         end = self.planner.grasp_joints(arm, "pick up", pin_mm)
         pin, scale = self.planner.in_base(arm, pin_mm), self.motion.approach_scale_mm
-        profile = self._profile(joints_rad, pin, scale, self.motion.lift_mm, self.motion.ground_clearance_mm)
+        profile = self._profile(arm, joints_rad, pin, scale, self.motion.lift_mm, self.motion.ground_clearance_mm)
         ends = np.stack([joints_rad, end])[:, :4]
         segment = self._eased(self._around_block(arm, pin_mm, ends, profile))
-        guesses = reaching_guesses(self.collision_model, ends, np.array([*pin, self.planner.pick_height_mm]), self.motion.lift_mm, True)
-        return self.timed(self._found(segment, self._chained(self._hops(ends), guesses), wanted=1))
+        body, pin_mm = self.planner.collision_models[arm], np.array([*pin, self.planner.model.cell.pick_heights_mm[arm]])
+        guesses = reaching_guesses(body, ends, pin_mm, self.motion.lift_mm, True)
+        return self.timed(arm, self._found(segment, self._chained(self._hops(arm, ends), guesses), wanted=1))
 
     def home(self, arm: int, joints_rad: Floats, block_mm: Floats) -> JointTrajectory:
         """The empty hand from ``joints_rad`` (5,) to the parked pose, past a block lying at ``block_mm`` (2,)."""
-        if self.parked(joints_rad):
-            return still(self.home_rad, STEP_S)
-        ends = np.stack([joints_rad, self.home_rad])[:, :4]
-        profile = self._profile(joints_rad, np.zeros(2), self.motion.approach_scale_mm, 0.0, self.motion.ground_clearance_mm)
+        if self.parked(arm, joints_rad):
+            return still(self.homes_rad[arm], STEP_S)
+        ends = np.stack([joints_rad, self.homes_rad[arm]])[:, :4]
+        profile = self._profile(arm, joints_rad, np.zeros(2), self.motion.approach_scale_mm, 0.0, self.motion.ground_clearance_mm)
         segment = self._eased(self._around_block(arm, block_mm, ends, profile))
-        return self.timed(self._found(segment, self._hops(ends), wanted=1))
+        return self.timed(arm, self._found(segment, self._hops(arm, ends), wanted=1))
 
     def from_pin(self, arm: int, pin_mm: Floats) -> JointTrajectory:
         """The opened hand from the pin at ``pin_mm`` (2,) to the parked pose."""
-        return self.timed(self.planner.reach(arm, self.home_rad, pin_mm, self.home_rad, leaving=True))
+        own, others = self.homes_rad[arm], self.planner.others_home_rad(arm)
+        return self.timed(arm, self.planner.reach(arm, own, pin_mm, others, leaving=True))
 
     def carry(self, arm: int, pick_mm: Floats, place_mm: Floats) -> JointTrajectory:
         """The hand with the block from where it lay to where it is to lie, both (2,)."""
-        return self.timed(self.planner.transfer(arm, pick_mm, place_mm, self.home_rad))
+        return self.timed(arm, self.planner.transfer(arm, pick_mm, place_mm, self.planner.others_home_rad(arm)))
 
     def carry_on(self, arm: int, joints_rad: Floats, place_mm: Floats) -> JointTrajectory:
         """The hand with the block from ``joints_rad`` (5,) in mid-air to ``place_mm`` (2,)."""
@@ -188,17 +188,17 @@ class FreePaths:
         ends = np.stack([joints_rad, planner.grasp_joints(arm, "place", place_mm)])[:, :4]
         if self._same(ends[0], ends[1]):
             return still(joints_rad, STEP_S)
-        ends_mm = np.stack([self._hand_mm(joints_rad), planner.in_base(arm, place_mm)])
+        ends_mm = np.stack([self._hand_mm(arm, joints_rad), planner.in_base(arm, place_mm)])
         distance = max(math.dist(*ends_mm), STILL_MM)
         share = min(1.0, distance / (2 * motion.lift_scale_mm))
         scale, lift_mm = share * motion.lift_scale_mm, share * motion.lift_mm
         profile = np.array([*ends_mm[0], *ends_mm[1], scale, scale, lift_mm, share * motion.ground_clearance_mm])
-        loaded = self._loaded[arm]
+        loaded, body = self._loaded[arm], planner.collision_models[arm]
         bound = string_length(distance, scale, lift_mm)
-        expected = bound + detour_length(ends_mm, GRIP_LEAST_MM)
+        expected = bound + detour_length(ends_mm, proportions(body.planar).grip_least_mm)
         segment = replace(loaded, ends=ends, scene=loaded.scene._replace(profile=profile), lower_bound_mm=distance, expected_mm=expected)
-        guesses = carrying_guesses(self.collision_model, ends, ends_mm, planner.pick_height_mm, lift_mm)
-        return self.timed(self._found(self._eased(segment), self._chained(guesses, self._hops(ends))))
+        guesses = carrying_guesses(body, ends, ends_mm, planner.model.cell.pick_heights_mm[arm], lift_mm)
+        return self.timed(arm, self._found(self._eased(segment), self._chained(guesses, self._hops(arm, ends))))
 
     def clear_of_block(self, arm: int, joints_rad: Floats, block_mm: Floats) -> bool:
         """Whether an arm at all of ``joints_rad`` (n, 5), its hand empty, keeps off a block lying at ``block_mm`` (2,)."""
@@ -208,7 +208,7 @@ class FreePaths:
 
     def allows(self, arm: int, joints_rad: Floats, block_mm: Floats | None) -> bool:
         """Whether ``joints_rad`` (n, 5) keep their limits and all clearances; ``block_mm`` (2,): where it lies, None: in the hand."""
-        arm_model = self.planner.model.arm
+        arm_model = self.planner.model.arms[arm]
         if (joints_rad < arm_model.lower_rad).any() or (joints_rad > arm_model.upper_rad).any():
             return False
         profile = np.zeros(8)  # how high a hand travels is no matter of touching
@@ -220,17 +220,17 @@ class FreePaths:
         margins, _ = segment.check(joints_rad[:, :4])
         return min(margins.arm, margins.block, margins.itself, margins.ground, margins.edge) >= 0.0
 
-    def timed(self, found: FoundPath) -> JointTrajectory:
-        """A path with its time law."""
+    def timed(self, arm: int, found: FoundPath) -> JointTrajectory:
+        """A path of an arm with its time law."""
         self.planned += 1
-        return time_path(found.points, self.motion.degree, self.velocity_rad_s, self.acceleration_rad_s2, STEP_S)
+        return time_path(found.points, self.motion.degree, *self.limits[arm], STEP_S)
 
     def _found(self, segment: Segment, guesses: Iterator[Floats], wanted: int = 2) -> FoundPath:
         return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.num_initial_guesses, wanted=wanted)
 
-    def _profile(self, joints_rad: Floats, end_mm: Floats, scale_mm: float, lift_mm: float, ground_mm: float) -> Floats:
+    def _profile(self, arm: int, joints_rad: Floats, end_mm: Floats, scale_mm: float, lift_mm: float, ground_mm: float) -> Floats:
         """The lift-over of an empty hand: it asks for nothing where the hand is, nor near a pin."""
-        return np.array([*self._hand_mm(joints_rad), *end_mm, scale_mm, scale_mm, lift_mm, ground_mm])
+        return np.array([*self._hand_mm(arm, joints_rad), *end_mm, scale_mm, scale_mm, lift_mm, ground_mm])
 
     def _around_block(self, arm: int, block_mm: Floats, ends: Floats, profile: Floats) -> Segment:
         """A way of the empty hand past a block that lies at a world position."""
@@ -256,20 +256,20 @@ class FreePaths:
         )
         return replace(segment, scene=scene)
 
-    def _hops(self, ends: Floats) -> Iterator[Floats]:
+    def _hops(self, arm: int, ends: Floats) -> Iterator[Floats]:
         """Guesses (SAMPLES, 4): straight; or drawn in towards the parked posture half-way, a little or nearly all of it."""
         t = np.linspace(0.0, 1.0, SAMPLES)[:, None]
         line = ends[0] + (ends[1] - ends[0]) * t
         yield line
         for share in (0.4, 0.9):
             path = line.copy()
-            path[:, 1:] += share * (self.home_rad[1:4] - path[:, 1:]) * np.sin(math.pi * t) ** 0.5
+            path[:, 1:] += share * (self.homes_rad[arm, 1:4] - path[:, 1:]) * np.sin(math.pi * t) ** 0.5
             path[0], path[-1] = ends
             yield path
 
-    def _hand_mm(self, joints_rad: Floats) -> Floats:
-        """Where the grip is over the table (2,), in the arm's base frame."""
-        return self.planner.model.arm.grip_mm(joints_rad)[:2]
+    def _hand_mm(self, arm: int, joints_rad: Floats) -> Floats:
+        """Where an arm's grip is over the table (2,), in its base frame."""
+        return self.planner.model.arms[arm].grip_mm(joints_rad)[:2]
 
     @staticmethod
     def _same(one: Floats, other: Floats) -> bool:
@@ -296,7 +296,7 @@ class MotionPrograms:
     def cycle(self, command: TransferCommand, pose: Floats) -> list[MotionSegment]:
         """The whole transfer of a block lying at ``pose`` (3,), all arms being parked."""
         arm, pin = command.arm, pose[:2].copy()
-        approach = MotionSegment("approach", arm, 1.0, 1.0, None, lambda: self.paths.to_pin(arm, self.paths.home_rad, pin))
+        approach = MotionSegment("approach", arm, 1.0, 1.0, None, lambda: self.paths.to_pin(arm, self.paths.homes_rad[arm], pin))
         return [approach, *self._from_grasp(command, pose)]
 
     def home(self, arm: int, joints_rad: Floats, pose: Floats) -> MotionSegment:
@@ -340,7 +340,8 @@ class MotionPrograms:
         segment = world.program[0]
         if segment.track is None:
             return still(world.joints_rad[segment.arm].copy(), STEP_S)
-        return stopped(segment.track, world.clock_s, self.paths.acceleration_rad_s2)
+        _, acceleration_rad_s2 = self.paths.limits[segment.arm]
+        return stopped(segment.track, world.clock_s, acceleration_rad_s2)
 
     def _onward(self, world: WorldState, kind: str) -> MotionSegment:
         """From where the empty hand is to the pin (approach) or home (retreat)."""
@@ -350,8 +351,7 @@ class MotionPrograms:
         return MotionSegment(kind, segment.arm, float(world.opened[segment.arm]), 1.0, self._joined(segment.arm, stop, onward, block))
 
     def _joined(self, arm: int, stop: JointTrajectory, onward: JointTrajectory, block_mm: Floats | None) -> JointTrajectory:
-        limits = self.paths.velocity_rad_s, self.paths.acceleration_rad_s2
-        return joined(stop, onward, *limits, lambda joints: self.paths.allows(arm, joints, block_mm))
+        return joined(stop, onward, *self.paths.limits[arm], lambda joints: self.paths.allows(arm, joints, block_mm))
 
     def _from_grasp(self, command: TransferCommand, pose: Floats) -> list[MotionSegment]:
         """From the open hand at the pin on."""

@@ -45,9 +45,9 @@ class WorldState:
         clock_s: time in its first piece.
     """
 
-    def __init__(self, model: CellModel, home_rad: Floats, pose: Floats) -> None:
+    def __init__(self, model: CellModel, homes_rad: Floats, pose: Floats) -> None:
         self.model = model
-        self.joints_rad = np.tile(home_rad, (model.cell.num_arms, 1))
+        self.joints_rad = homes_rad.copy()
         self.opened = np.ones(model.cell.num_arms)
         self.pose = np.array(pose, float)
         self.held = False
@@ -104,7 +104,7 @@ class WorldState:
 
     def grip(self, arm: int) -> Floats:
         """T_world_grip (4, 4) in mm."""
-        return np.asarray(self.model.cell.bases[arm].matrix() @ self.model.arm.fk(self.joints_rad[arm]))
+        return np.asarray(self.model.cell.bases[arm].matrix() @ self.model.arms[arm].fk(self.joints_rad[arm]))
 
     def phase(self) -> str:
         """Name of what is under way, as in a planned cycle; "" for nothing."""
@@ -113,7 +113,7 @@ class WorldState:
         segment = self.program[0]
         if segment.kind != "carry":
             return segment.kind
-        if self.grip(self.arm)[2, 3] >= self.model.cell.pick_height_mm + LIFTED_MM:
+        if self.grip(self.arm)[2, 3] >= self.model.cell.pick_heights_mm[self.arm] + LIFTED_MM:
             return "transfer"
         return "lift" if segment.track is None or self.clock_s < segment.track.duration_s / 2 else "lower"
 
