@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
 from marl_handover.arrays import Floats
-from marl_handover.cell import NO_ARM
+from marl_handover.cell import NO_ARM, Cell
 from marl_handover.cell.build import CellModel
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import LoopConfig, MotionConfig
@@ -31,6 +32,11 @@ MOST_TRANSFERS = LoopConfig().transfers
 """An episode that takes more is given up."""
 
 
+def _reaches(cell: Cell) -> list[tuple[Any, ...]]:
+    """Where each arm of a cell stands and what it reaches: cells whose settings say the same in other words are alike."""
+    return [(arm.base, arm.r_min_mm, arm.r_max_mm, arm.yaw_rad) for arm in cell.arms] + [(cell.config.chart_inset,), cell.pick_heights_mm]
+
+
 class PolicyAdapter:
     """A policy under the exact rule book of the cell.
 
@@ -47,7 +53,7 @@ class PolicyAdapter:
         policy.require_executors()
         own = policy.rules.cell.config
         cell = model.cell.with_inset(own.chart_inset)
-        if cell.config != own:
+        if _reaches(cell) != _reaches(policy.rules.cell):
             raise InvalidSetting("policy", policy.name, f"one for the cell {model.cell.config.name!r}; this one is for {own.name!r}")
         self.rules = Rules(cell, policy.rules.config, motion_cost(cell, policy.rules.config, motion))
         self.policy = policy.under(self.rules)
