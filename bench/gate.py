@@ -29,13 +29,12 @@ from numpy.typing import NDArray
 from marl_handover.cell.build import CellModel, build_cell, cell_config
 from marl_handover.compiled import compiled
 from marl_handover.config import MotionConfig
-from marl_handover.geometry.capsules import capsule_pairs
+from marl_handover.geometry.capsules import block_capsules, capsule_pairs
 from marl_handover.geometry.se3 import transform
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import nominal_calibration
 from marl_handover.hardware.safety_filter import LAG_S, CommandRejected, JointCommand, Reason, SafetyFilter
 from marl_handover.hardware.settings import ARMS, HardwareConfig
-from marl_handover.motion.collision_model import block_capsules
 from marl_handover.motion.planner import MotionPlanner
 
 Floats = NDArray[np.float64]

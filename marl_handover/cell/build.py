@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from marl_handover.cell.arm import Arm, mirrored_pair
 from marl_handover.cell.cell import Cell
-from marl_handover.cell.reach import AnnulusFit, ManipulationGrid, fit_annulus, manipulation_grid
+from marl_handover.cell.reach import AnnulusFit, ManipulationGrid, fit_annulus, manipulation_grid, require_grasps
 from marl_handover.compose import from_yaml, to_yaml
 from marl_handover.config import CellConfig, RobotConfig, require_choice
 from marl_handover.errors import InvalidSetting, UnequalArms
@@ -68,6 +68,8 @@ def build_cell(config: CellConfig) -> CellModel:
     fits = {}
     for robot in settings:
         alike = [index for index, each in enumerate(robots) if each == robot]
+        if not grid.masks[alike].any():
+            require_grasps(models[robot], settings[robot].pick_height_mm, config.block)
         fits[robot] = fit_annulus(grid, config.fit_rounding_mm, arms=alike)
     listed = []
     for name, base, robot, mirror in zip(names, bases, robots, mirrors, strict=True):

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from marl_handover.config import CellConfig, RobotConfig, check_bounds, require_at_least
-from marl_handover.errors import InvalidSetting
+from marl_handover.config import BlockConfig, CellConfig, MotionConfig, RobotConfig, check_bounds, require_at_least
+from marl_handover.errors import InvalidSetting, UrdfError
 from marl_handover.geometry.arm_model import ArmModel
-from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
+from marl_handover.geometry.capsules import block_capsules, grasp_margins_mm
 from marl_handover.geometry.closed_form import Bools, Floats
 from marl_handover.geometry.se2 import SE2
+from marl_handover.geometry.urdf import ARM_JOINTS
 
 LENGTH_TOLERANCE_MM = 1e-6
 MOST_POINTS = 10**6
@@ -57,21 +58,62 @@ class AnnulusFit:
     missed_rate: float
 
 
-def feasible(arm: ArmModel, points_base_mm: ArrayLike, pick_height_mm: float) -> Bools:
-    """Whether the arm can hold the pin at table points (..., 2) of its base frame with pitch = roll = 0; shape (...).
+def grasps(arm: ArmModel, points_base_mm: ArrayLike, pick_height_mm: float) -> tuple[Floats, Bools]:
+    """Joint vectors (..., 5) that hold the pin at table points (..., 2) of the base frame with pitch = roll = 0, and where there are some.
 
-    That is so if one of the two elbow branches is within the joint limits and keeps all links off each other and off the ground.
+    The one that motions take: elbow up where both branches are within the joint limits.
     """
     points = np.asarray(points_base_mm, dtype=float)
-    position = np.concatenate([points, np.full((*points.shape[:-1], 1), float(pick_height_mm))], axis=-1)
-    q = arm.ik(position)
+    q = arm.ik(np.concatenate([points, np.full((*points.shape[:-1], 1), float(pick_height_mm))], axis=-1))
     good = arm.within_limits(q)
-    # Collision is the dear part: only branches that passed the limits are looked at.
-    candidates = q[good]
-    clear = ground_clearance_mm(arm, candidates) > 0
-    clear[clear] = self_clearance_mm(arm, candidates[clear]) > 0
-    good[good] = clear
-    return np.asarray(good.any(axis=-1))
+    chosen = np.take_along_axis(q, good.argmax(axis=-1)[..., None, None], axis=-2)[..., 0, :]
+    return chosen, np.asarray(good.any(axis=-1))
+
+
+def feasible(arm: ArmModel, points_base_mm: ArrayLike, pick_height_mm: float, block: BlockConfig | None = None) -> Bools:
+    """Whether the arm can hold the pin of ``block`` at table points (..., 2) of its base frame with pitch = roll = 0; shape (...).
+
+    That is so if the joints are within their limits, and the links, with the block in the hand, keep the clearances that motion planning
+    demands by default, from each other and from the table.
+    """
+    q, good = grasps(arm, points_base_mm, pick_height_mm)
+    # Collision is the dear part: only what passed the limits is looked at.
+    margins = grasp_margins_mm(arm, q[good], MotionConfig(), block_capsules(block or BlockConfig(), pick_height_mm))
+    good[good] = np.min([np.full(int(good.sum()), np.inf), *margins.values()], axis=0) >= 0
+    return good
+
+
+def bound_by(arm: ArmModel, radius_mm: float, pick_height_mm: float, block: BlockConfig) -> str:
+    """What keeps the arm from picking and placing ``radius_mm`` from its base at all yaws: joints, two links, a link and the table.
+
+    Empty where nothing does.
+    """
+    yaws = np.linspace(arm.lower_rad[0], arm.upper_rad[0], 73)[1:-1]
+    points = radius_mm * np.stack([np.cos(yaws), np.sin(yaws)], axis=-1)
+    q, good = grasps(arm, points, pick_height_mm)
+    if not good.all():
+        branches = arm.ik([*points[~good][0], pick_height_mm])
+        if np.isnan(branches).any():
+            return "the length of the arm"
+        over = np.maximum(branches - arm.upper_rad, arm.lower_rad - branches)
+        nearest = over[over.max(axis=-1).argmin()]
+        return f"the limits of {ARM_JOINTS[int(nearest.argmax())]}"
+    margins = grasp_margins_mm(arm, q, MotionConfig(), block_capsules(block, pick_height_mm))
+    pair = min(margins, key=lambda pair: float(margins[pair].min()), default=None)
+    return f"{pair[0]} and {pair[1]}" if pair and margins[pair].min() < 0 else ""
+
+
+def require_grasps(arm: ArmModel, pick_height_mm: float, block: BlockConfig) -> None:
+    """Raise :class:`UrdfError`, which names two bodies, if the joints could take the grip to the table but shapes are always in the way."""
+    points = np.stack([np.arange(1.0, arm.reach_mm), np.zeros(int(arm.reach_mm - 1e-9))], axis=-1)
+    q, good = grasps(arm, points, pick_height_mm)
+    margins = grasp_margins_mm(arm, q[good], MotionConfig(), block_capsules(block, pick_height_mm))
+    if not good.any() or not margins:
+        return
+    (one, other), _ = max(margins.items(), key=lambda item: float(np.mean(item[1] < 0)))
+    where = f"in every posture that holds the pin at pick_height_mm = {pick_height_mm:g}"
+    what = f"{one!r} and {other!r} are too near to each other {where}; mend their shapes, or set shapes=links"
+    raise UrdfError(arm.description.path, what)
 
 
 def manipulation_grid(
@@ -93,7 +135,9 @@ def manipulation_grid(
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     usual = RobotConfig.pick_height_mm if cell.pick_height_mm is None else cell.pick_height_mm
     heights = tuple(float(height) for height in pick_heights_mm or [usual] * len(arms))
-    masks = np.stack([feasible(arm, base.to_local(points), height) for arm, base, height in zip(arms, bases, heights, strict=True)])
+    masks = np.stack(
+        [feasible(arm, base.to_local(points), height, cell.block) for arm, base, height in zip(arms, bases, heights, strict=True)]
+    )
     for array in (*axes, masks):
         array.setflags(write=False)
     return ManipulationGrid(axes[0], axes[1], masks, tuple(bases), heights)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from marl_handover.cell import CellModel, build_cell
+from marl_handover.cell.reach import bound_by
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import CELL_ALIASES, CellConfig, path_field
 
@@ -61,6 +62,11 @@ def workspace_summary(model: CellModel) -> dict[str, Any]:
         "bases": {letter: [base.x_mm, base.y_mm] for letter, base in zip(ARM_LETTERS, cell.bases, strict=True)},
         "grid_mm": cell.config.grid_mm,
         "grid_points": {**points, "both": int(masks.all(0).sum())},
+        "bound_by": {
+            "r_min": bound_by(model.arm, fit.r_min_mm - cell.config.grid_mm, cell.pick_height_mm, cell.config.block),
+            "r_max": bound_by(model.arm, fit.r_max_mm + cell.config.grid_mm, cell.pick_height_mm, cell.config.block),
+        },
+        "ignored_pairs": [list(pair) for pair in model.arm.description.ignored],
         "fit": {"false_inside_rate": fit.false_inside_rate, "missed_rate": fit.missed_rate},
     }
 
@@ -71,6 +77,7 @@ def _text(summary: dict[str, Any]) -> str:
     rows = {
         "cell": summary["cell"],
         "annulus": f"{summary['r_min_mm']:g} to {summary['r_max_mm']:g} mm",
+        "ends at": f"{summary['bound_by']['r_min'] or 'the fit'} (inside), {summary['bound_by']['r_max'] or 'the fit'} (outside)",
         "base yaw": f"{low:.1f} to {high:.1f} deg",
         "base distance": f"{summary['base_distance_mm']:g} mm",
         "shared space": f"|x| <= {summary['x_max_mm']:.1f} mm, |y| <= {summary['y_max_at_0_mm']:.1f} mm at x = 0, "
@@ -79,4 +86,6 @@ def _text(summary: dict[str, Any]) -> str:
         "grid points": ", ".join(f"{name} {count}" for name, count in points.items()) + f", every {summary['grid_mm']:g} mm",
         "fit": f"{summary['fit']['false_inside_rate']:.2%} of the points inside out of reach, {summary['fit']['missed_rate']:.2%} missed",
     }
+    if summary["ignored_pairs"]:
+        rows["ignored pairs"] = "; ".join(" and ".join(pair) for pair in summary["ignored_pairs"]) + ", which touch in every posture"
     return "\n".join(f"{name:<14} {value}" for name, value in rows.items())

@@ -73,8 +73,11 @@ def elbow_up(planar: Floats, r: Floats, z: Floats, pitch: Floats, out: Floats) -
 
 
 @compiled
-def place_capsules(capsules: Floats, frames: Floats, i: int, ends: Floats) -> None:
-    """Fill ``ends`` (K, 10): both end points (r, t, z), then the midpoint and half the length."""
+def place_capsules(capsules: Floats, yaw: float, frames: Floats, i: int, ends: Floats) -> None:
+    """Fill ``ends`` (K, 10): both end points (r, t, z), then the midpoint and half the length.
+
+    Seen from the arm's plane, the base turns against the yaw; most of it is around the yaw axis and looks the same.
+    """
     for k in range(capsules.shape[0]):
         level = int(capsules[k, 0])
         r0, z0, c, s = frames[i, level, 0], frames[i, level, 1], frames[i, level, 2], frames[i, level, 3]
@@ -86,6 +89,14 @@ def place_capsules(capsules: Floats, frames: Floats, i: int, ends: Floats) -> No
         for axis in range(3):
             ends[k, 6 + axis] = 0.5 * (ends[k, axis] + ends[k, 3 + axis])
         ends[k, 9] = capsules[k, 8]
+    base = 0
+    while base < capsules.shape[0] and capsules[base, 0] == 0.0:
+        if ends[base, 0] != 0.0 or ends[base, 1] != 0.0 or ends[base, 3] != 0.0 or ends[base, 4] != 0.0:
+            cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+            for column in (0, 3, 6):
+                x, y = ends[base, column], ends[base, column + 1]
+                ends[base, column], ends[base, column + 1] = cos_yaw * x + sin_yaw * y, cos_yaw * y - sin_yaw * x
+        base += 1
 
 
 @compiled
@@ -174,7 +185,7 @@ def world_shapes(joints: Floats, planar: Floats, capsules: Floats, x: float, y: 
     out, frames, ends = np.empty((S, K, 11)), np.empty((1, 5, 4)), np.empty((K, 10))
     for i in range(S):
         forward_kinematics(planar, joints, i, frames, 0)
-        place_capsules(capsules, frames, 0, ends)
+        place_capsules(capsules, joints[i, 0], frames, 0, ends)
         c, s = math.cos(joints[i, 0] + facing), math.sin(joints[i, 0] + facing)
         for k in range(K):
             for e in range(0, 9, 3):
@@ -206,7 +217,7 @@ def can_meet(planar: Floats, capsules: Floats, a: int, b: int, need: float, limi
                 for joint, index in enumerate((i, j, k)):
                     q[0, joint + 1] = limits[joint + 1, 0] + 2.0 * half[joint] * index
                 forward_kinematics(planar, q, 0, frames, 0)
-                place_capsules(capsules, frames, 0, ends)
+                place_capsules(capsules, 0.0, frames, 0, ends)
                 slack = 0.0
                 for joint in range(3):
                     if half[joint] > 0.0:

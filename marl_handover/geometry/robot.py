@@ -7,9 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from marl_handover.compose import from_yaml, option_names
-from marl_handover.config import RobotConfig
+from marl_handover.config import MotionConfig, RobotConfig
 from marl_handover.errors import MissingFile, UnknownChoice
 from marl_handover.files import expanded, resource_path
+from marl_handover.geometry.capsules import touching_links
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.urdf import read_urdf
 
@@ -65,4 +66,7 @@ def read_robot(config: RobotConfig, limits_deg: Mapping[str, Sequence[float]] | 
         UnknownKey, InvalidSetting: of limits.
     """
     description = read_urdf(config.urdf, config.tip or "grip")
-    return ClosedFormArm(description, {**config.joint_limits_deg, **(limits_deg or {})})
+    limits = {**config.joint_limits_deg, **(limits_deg or {})}
+    arm = ClosedFormArm(description, limits)
+    ignored = touching_links(arm, MotionConfig())
+    return ClosedFormArm(replace(description, ignored=ignored), limits) if ignored else arm

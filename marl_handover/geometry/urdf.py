@@ -156,6 +156,7 @@ class ArmDescription:
     Attributes:
         sources: of each of :data:`ARM_JOINTS`, the URDF's joint.
         assumed: what the file does not say, and was taken to be so; in words.
+        ignored: pairs of links that touch in every posture, such as shells of one housing; nobody asks how far they are apart.
     """
 
     path: Path
@@ -167,6 +168,7 @@ class ArmDescription:
     gripper: Gripper = Gripper()
     sources: tuple[JointSource, ...] = tuple(JointSource(name) for name in ARM_JOINTS)
     assumed: tuple[str, ...] = ()
+    ignored: tuple[tuple[str, str], ...] = ()
 
     def joint(self, name: str) -> Joint:
         """The joint of this name. Raises :class:`UrdfError` if there is none."""

@@ -19,10 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from marl_handover.arrays import Floats
 from marl_handover.cell.build import CellModel
 from marl_handover.compiled import compiled
-from marl_handover.geometry.capsules import capsule_pairs, joints_before
+from marl_handover.geometry.capsules import block_capsules, capsule_pairs, joints_before
 from marl_handover.geometry.kernels import FAR_MM, broad_phase, closest_points
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.motion.collision_model import block_capsules
 
 Ints = NDArray[np.int64]
 

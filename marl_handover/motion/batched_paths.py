@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from marl_handover.arrays import Array, length, namespace, select
@@ -210,19 +211,27 @@ class MotionCheck:
     def _itself(self, frames: Frames, arm: Tensor, known: dict[str, Tensor]) -> Tensor:
         """Whether the arm and what it holds keep clear of itself, bool (n,)."""
         clearance = self.motion.self_clearance_mm
-        middles = [frames.at(int(row[0]), (row[1] + row[4]) / 2, (row[3] + row[6]) / 2) for row in self.capsules]
+        middles = [self._middle(frames, row) for row in self.capsules]
         close = []
         for one, other in self.pairs:
-            (r_1, z_1), (r_2, z_2), first, second = middles[one], middles[other], self.capsules[one], self.capsules[other]
+            (r_1, t_1, z_1), (r_2, t_2, z_2), first, second = middles[one], middles[other], self.capsules[one], self.capsules[other]
             away = first[7] + second[7] + first[8] + second[8] + clearance
-            aside = (first[2] + first[5] - second[2] - second[5]) / 2
-            close.append((r_1 - r_2).square() + (z_1 - z_2).square() <= away**2 - aside**2)
+            close.append((r_1 - r_2).square() + (z_1 - z_2).square() <= away**2 - (t_1 - t_2) ** 2)
         if not close:
             return torch.ones_like(arm, dtype=torch.bool)
         pair, sample = torch.stack(close).flatten(1).nonzero().unbind(-1)
         some = frames.rows(sample)
         first, second = (_segments(some, known["capsules"][known["pairs"][pair, which]][:, None])[:, 0] for which in range(2))
         return _none_of(sample[nearer(first, second, clearance)], frames)
+
+    @staticmethod
+    def _middle(frames: Frames, row: NDArray[np.float64]) -> tuple[Tensor, Tensor | float, Tensor]:
+        """Where the middle (r, t, z) of a capsule is; one of the base turns against the yaw."""
+        x, y, z = ((row[axis] + row[axis + 3]) / 2 for axis in (1, 2, 3))
+        if row[0] == 0 and (x != 0 or y != 0):
+            return x * frames.cos_yaw + y * frames.sin_yaw, y * frames.cos_yaw - x * frames.sin_yaw, torch.full_like(frames.cos_yaw, z)
+        r, height = frames.at(int(row[0]), x, z)
+        return r, y, height
 
     def _others(self, frames: Frames, arm: Tensor, known: dict[str, Tensor]) -> Tensor:
         """Whether the moving arm and what it holds keep clear of the parked ones, bool (n,)."""
@@ -278,10 +287,13 @@ def nearer(first: Tensor, second: Tensor, clearance_mm: float) -> Tensor:
 def _segments(frames: Frames, capsules: Tensor) -> Tensor:
     """Placed capsules (m, K, 8): both ends (r, t, z), radius, half the length; of flat samples (m,) and capsule rows (m, K, 9)."""
     level = capsules[..., 0].long()
+    # Seen from the arm's plane, the base turns against the yaw.
+    cos_yaw, sin_yaw = (torch.where(level == 0, part[:, None], one) for part, one in ((frames.cos_yaw, 1.0), (frames.sin_yaw, 0.0)))
     r, z, cos, sin = (part.gather(1, level) for part in (frames.r, frames.z, frames.cos, frames.sin))
     columns = []
-    for x, t, height in (capsules[..., 1:4].unbind(-1), capsules[..., 4:7].unbind(-1)):
-        columns += [r + cos * x - sin * height, t, z + sin * x + cos * height]
+    for x, y, height in (capsules[..., 1:4].unbind(-1), capsules[..., 4:7].unbind(-1)):
+        ahead, t = cos_yaw * x + sin_yaw * y, cos_yaw * y - sin_yaw * x
+        columns += [r + cos * ahead - sin * height, t, z + sin * ahead + cos * height]
     return torch.stack([*columns, capsules[..., 7], capsules[..., 8]], -1)
 
 

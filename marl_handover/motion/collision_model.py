@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel
-from marl_handover.config import BlockConfig, MotionConfig
+from marl_handover.config import MotionConfig
 from marl_handover.errors import UrdfError
-from marl_handover.geometry.capsules import Capsule, capsule_pairs, joints_before
+from marl_handover.geometry.capsules import COVER_MM, block_capsules, capsule_pairs, joints_before, segment_distance
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.kernels import can_meet, world_shapes
 from marl_handover.geometry.se3 import apply, flat_pose
@@ -25,8 +25,8 @@ MARGIN_MM = 3.0
 
 GRID_RAD = math.radians(4.0)
 
-SPOKES = 3
-"""The block's footprint, whatever its orientation, is covered by this many capsules through its centre."""
+TURNS = 24
+"""At so many orientations of the block, over half a turn, its distance to the hand that grasps it is looked at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,8 @@ class CollisionModel:
 
     ``pairs`` index capsules that must not touch and might, within the joint ``limits`` (4, 2); the others are proved apart. ``edges``
     (2, 2) are the held block's lower front and rear edge in the wrist's frame. ``reach_mm``: nothing of the arm, or held by it, is ever
-    farther from the yaw axis; ``levers_mm`` (4,): the same of each joint's axis, of what it moves.
+    farther from the yaw axis; ``levers_mm`` (4,): the same of each joint's axis, of what it moves. ``block_clearance_mm`` (B,): demanded
+    between the hand and each shape of the standing block: as set, or what a grasp leaves where hand or fingers are as near as that.
     """
 
     planar: Floats
@@ -47,6 +48,7 @@ class CollisionModel:
     limits: Floats
     reach_mm: float
     levers_mm: Floats
+    block_clearance_mm: Floats
 
 
 class Scene(NamedTuple):
@@ -106,7 +108,7 @@ def arm_collision_model(model: CellModel, motion: MotionConfig, index: int) -> C
         ends = [apply(T_base_link, end) for end in (shape.start_mm, shape.end_mm)]
         offset = np.array([pivots[level][0], 0.0, pivots[level][1]])
         rows.append([level, *(ends[0] - offset), *(ends[1] - offset), shape.radius_mm])
-    shaped = _with_half_lengths([_standing(row) if row[0] == 0 else row for row in rows], 1)
+    shaped = _with_half_lengths(rows, 1)
     order = np.argsort([row[0] for row in rows], kind="stable")
     rank = np.argsort(order)
     capsules = shaped[order]
@@ -126,38 +128,25 @@ def arm_collision_model(model: CellModel, motion: MotionConfig, index: int) -> C
     all_pairs = np.concatenate([pairs, np.array(with_held, np.int64)])
     need = motion.self_clearance_mm + MARGIN_MM
     steps = np.maximum(np.ceil((limits[1:, 1] - limits[1:, 0]) / GRID_RAD), 2).astype(np.int64)
-    meeting = [can_meet(planar, held, a, b, held[a, 7] + held[b, 7] + need, limits, steps) for a, b in all_pairs]
+    # A base that stands out from the yaw axis is taken at all yaws here.
+    swept = np.array([_swept(row) if row[0] == 0 else row for row in held])
+    meeting = [can_meet(planar, swept, a, b, swept[a, 7] + swept[b, 7] + need, limits, steps) for a, b in all_pairs]
     all_pairs = all_pairs[np.array(meeting, bool)]
-    fixed, hand = held[held[:, 0] < 2], held[held[:, 0] >= 4]
+    fixed, hand = swept[held[:, 0] < 2], held[held[:, 0] >= 4]
     grouped = (held[all_pairs[:, 0], 0] < 2) & (held[all_pairs[:, 1], 0] >= 4)
     all_pairs = np.concatenate([all_pairs[grouped], all_pairs[~grouped]])  # the kernels skip the first ones together
     planar = np.concatenate([planar, _planar_ball(fixed), _planar_ball(hand)])
     levers = _levers_mm(planar, held, limits)
     bare_pairs = all_pairs[all_pairs.max(axis=1) < len(capsules)]
-    return CollisionModel(planar, capsules, bare_pairs, held, all_pairs, edges, limits, float(levers[0]), levers)
+    at_grasp = _at_grasp_mm(capsules[capsules[:, 0] >= 4], held[len(capsules) :], arm)
+    near = np.clip(at_grasp, -COVER_MM, motion.block_clearance_mm)
+    return CollisionModel(planar, capsules, bare_pairs, held, all_pairs, edges, limits, float(levers[0]), levers, near)
 
 
-def _standing(row: list[float]) -> list[float]:
-    """A capsule of the base, which does not turn with the yaw, as one that may: on the yaw axis, around all its places."""
+def _swept(row: Floats) -> Floats:
+    """A capsule row of the base around all places it has, seen from the arm's plane: on the yaw axis."""
     wide = max(math.hypot(row[1], row[2]), math.hypot(row[4], row[5]))
-    return [row[0], 0.0, 0.0, row[3], 0.0, 0.0, row[6], row[7] + wide]
-
-
-def block_capsules(block: BlockConfig, grip_to_table_mm: float) -> list[Capsule]:
-    """Capsules around the block and its pin in a frame at the grip, z up; they hold for every orientation of the block about the pin."""
-    half_side, half_height = block.side_mm / 2, block.height_mm / 2
-    corner = half_side * math.sqrt(2)
-    turn = math.pi / (2 * SPOKES)
-    radius = math.hypot(corner * math.sin(turn), half_height)
-    reach = corner * math.cos(turn)
-    centre = half_height - grip_to_table_mm
-    shapes = []
-    for spoke in range(SPOKES):
-        x, y = reach * math.cos(spoke * math.pi / SPOKES), reach * math.sin(spoke * math.pi / SPOKES)
-        shapes.append(Capsule("block", (-x, -y, centre), (x, y, centre), radius))
-    pin = block.pin_diameter_mm / 2
-    bottom, top = block.height_mm - grip_to_table_mm, block.pin_top_mm - grip_to_table_mm - pin
-    return [*shapes, Capsule("pin", (0.0, 0.0, bottom), (0.0, 0.0, top), pin)]
+    return np.array([row[0], 0.0, 0.0, row[3], 0.0, 0.0, row[6], row[7] + wide, abs(row[6] - row[3]) / 2])
 
 
 def standing_arm(
@@ -180,12 +169,15 @@ def standing_arm(
     return _with_half_lengths(listed, 0)
 
 
-def standing_block(model: CellModel, motion: MotionConfig, place_mm: Floats) -> Floats:
+def standing_block(body: CollisionModel, model: CellModel, place_mm: Floats) -> Floats:
     """Obstacle rows of the block standing at ``place_mm`` (2,) of a moving arm's base frame."""
     height = model.cell.pick_heights_mm[0]  # where its frame is; its shapes are over the table
     at = np.array([place_mm[0], place_mm[1], height])
     shapes = block_capsules(model.cell.config.block, height)
-    rows = [[*(at + shape.start_mm), *(at + shape.end_mm), shape.radius_mm, motion.block_clearance_mm] for shape in shapes]
+    rows = [
+        [*(at + shape.start_mm), *(at + shape.end_mm), shape.radius_mm, clearance]
+        for shape, clearance in zip(shapes, body.block_clearance_mm, strict=True)
+    ]
     return _with_half_lengths(rows, 0)
 
 
@@ -197,6 +189,18 @@ def ball_around(obstacles: Floats) -> Floats:
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     away = np.linalg.norm(obstacles[:, :6].reshape(-1, 2, 3) - centre, axis=-1).max(axis=1) + obstacles[:, 6]
     return np.array([*centre, away.max(), obstacles[:, 7].max()])
+
+
+def _at_grasp_mm(hand: Floats, block: Floats, arm: ClosedFormArm) -> Floats:
+    """How near capsules (K, 9) of the hand come to each of the block's (B, 9) while it is grasped, its pin in any orientation: (B,)."""
+    if not len(hand):
+        return np.full(len(block), np.inf)
+    grip, angle, turn = np.array(_shifted((0.0, 0.0, 0.0), arm)), np.arange(TURNS) * math.pi / TURNS, np.zeros((TURNS, 3, 3))
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 2, 2] = np.cos(angle), -np.sin(angle), 1.0
+    turn[:, 1, 0], turn[:, 1, 1] = np.sin(angle), np.cos(angle)
+    start, end = (np.einsum("nij,bj->nbi", turn, block[:, at : at + 3] - grip)[:, :, None] + grip for at in (1, 4))
+    gap = segment_distance(hand[:, 1:4], hand[:, 4:7], start, end) - block[:, None, 7] - hand[:, 7]
+    return np.asarray(gap.min(axis=(0, 2)))
 
 
 def _shifted(point_mm: tuple[float, float, float], arm: ClosedFormArm) -> tuple[float, float, float]:

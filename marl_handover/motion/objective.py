@@ -116,7 +116,7 @@ def lagrangian(Q: Floats, scene: Scene, penalties: Penalty, grad: Floats, values
         grip[i, 0], grip[i, 1], grip[i, 2] = r * cy - aside * sy, r * sy + aside * cy, z
         if i == 0 or i == samples - 1:
             continue  # the ends are given
-        place_capsules(capsules, frames, i, ends)
+        place_capsules(capsules, Q[i, 0], frames, i, ends)
         if obstacles.shape[0] > 0:
             penalty += _obstacles(
                 i, cy, sy, first, capsules, obstacles, group, lam, rho, frames, ends, worst, contact, placed, point, close, grad, values
@@ -317,7 +317,7 @@ def dense_margins(Q: Floats, scene: Scene, out: Floats) -> float:
     for stride in (COARSE, 1):
         for i in range(0, Q.shape[0], stride):
             forward_kinematics(planar, Q, i, frames, 0)
-            place_capsules(capsules, frames, 0, ends)
+            place_capsules(capsules, Q[i, 0], frames, 0, ends)
             cy, sy = math.cos(Q[i, 0]), math.sin(Q[i, 0])
             _around(cy, sy, first, hand, planar, capsules, obstacles, scene.arm_rows, frames, ends, placed, point, out)
             _self_margin(first, scene.carried, planar, capsules, pairs, scene.clearance, frames, ends, point, out)

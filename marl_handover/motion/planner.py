@@ -181,8 +181,8 @@ class MotionPlanner:
         scales = (scale, 0.0) if leaving else (0.0, scale)
         profile = np.array([*pin, *pin, *scales, self.motion.lift_mm, self.motion.ground_clearance_mm])
         others = self._other(arm, other_joints_rad)
-        obstacles = np.concatenate([others, standing_block(self.model, self.motion, pin)])
         body, pin_mm = self.collision_models[arm], np.array([*pin, self.model.cell.pick_heights_mm[arm]])
+        obstacles = np.concatenate([others, standing_block(body, self.model, pin)])
         segment = Segment(body, self._scene(arm, False, obstacles, len(others), profile), ends, 0.0, 0.0)
         return segment, reaching_guesses(body, ends, pin_mm, self.motion.lift_mm, not leaving)
 

@@ -19,10 +19,9 @@ from marl_handover.cell.build import CellModel
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import MotionConfig
 from marl_handover.errors import CorruptFile, InvalidSetting, WorkFailed
-from marl_handover.geometry.capsules import Capsule, capsule_pairs, ground_clearance_mm, segment_distance
+from marl_handover.geometry.capsules import Capsule, block_capsules, capsule_pairs, ground_clearance_mm, segment_distance
 from marl_handover.geometry.se3 import apply
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.motion.collision_model import block_capsules
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import LOADED_PHASES, PHASES, Phase, PickPlacePaths, TransferMotion
 from marl_handover.report.figure_style import BLUE, FAINT, GREY, INK, PAPER, RED, YELLOW, arm_colour, ruled

@@ -9,9 +9,8 @@ import numpy as np
 
 from marl_handover import policies
 from marl_handover.control.interactive.cell import InteractiveCell, Snapshot
-from marl_handover.geometry.capsules import capsule_pairs, segment_distance
+from marl_handover.geometry.capsules import block_capsules, capsule_pairs, segment_distance
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.motion.collision_model import block_capsules
 
 DT_S = 0.02
 EXACT_MM = 0.05

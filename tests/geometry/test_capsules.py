@@ -9,7 +9,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from marl_handover.files import resource_path
-from marl_handover.geometry.capsules import enclosing_capsule, ground_clearance_mm, segment_distance, self_clearance_mm
+from marl_handover.geometry.capsules import (
+    COVER_MM,
+    MOST_CAPSULES,
+    ONE_CAPSULE_MM,
+    Capsule,
+    covering_capsules,
+    enclosing_capsule,
+    ground_clearance_mm,
+    segment_distance,
+    self_clearance_mm,
+)
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.se3 import transform
 from marl_handover.geometry.urdf import Primitive, read_urdf
@@ -92,6 +102,57 @@ def test_capsule_encloses_its_shape_closely(shape: Primitive) -> None:
     distance = segment_distance(points, points, start, end)
     assert distance.max() <= capsule.radius_mm + 1e-9
     assert distance.max() >= capsule.radius_mm - 0.1
+
+
+def outside_mm(capsules: tuple[Capsule, ...], points: Floats) -> Floats:
+    """How far points (n, 3) are outside of all capsules; negative inside one."""
+    gaps = []
+    for capsule in capsules:
+        start, end = (np.broadcast_to(np.array(v), points.shape) for v in (capsule.start_mm, capsule.end_mm))
+        gaps.append(segment_distance(points, points, start, end) - capsule.radius_mm)
+    return np.min(gaps, axis=0)
+
+
+edge = st.floats(2.0, 150.0)
+angle = st.floats(-3.0, 3.0)
+
+
+@given(size=st.tuples(edge, edge, edge), turn=st.tuples(angle, angle, angle))
+@settings(max_examples=60, deadline=None)
+def test_a_box_is_covered_and_what_stands_out_is_bounded(size: tuple[float, float, float], turn: tuple[float, float, float]) -> None:
+    shape = Primitive("box", size, (3.0, -4.0, 5.0), turn)
+    capsules = covering_capsules("link", shape)
+    assert len(capsules) <= MOST_CAPSULES
+    assert outside_mm(capsules, surface(shape, 500)).max() <= 1e-9
+    # The farthest points of a capsule from the box are in the directions of its faces.
+    T = transform(shape.xyz_mm, shape.rpy_rad)
+    ends = np.array([[capsule.start_mm, capsule.end_mm] for capsule in capsules]) - T[:3, 3]
+    excess = (np.abs(ends @ T[:3, :3]).max(axis=(0, 1)) + capsules[0].radius_mm - np.array(size) / 2).max()
+    if len(capsules) == 1:
+        assert excess <= ONE_CAPSULE_MM["box"] + 1e-9
+    elif max(size) <= 60.0:
+        assert excess <= COVER_MM + 1e-9
+
+
+@given(radius=st.floats(5.0, 100.0), length=st.floats(2.0, 200.0))
+@settings(max_examples=40, deadline=None)
+def test_a_cylinder_is_covered(radius: float, length: float) -> None:
+    shape = Primitive("cylinder", (radius, length), (1.0, 2.0, 3.0), (0.4, 0.0, 0.2))
+    assert outside_mm(covering_capsules("link", shape), surface(shape, 500)).max() <= 1e-9
+
+
+def test_every_shape_of_the_shipped_arm_keeps_its_one_capsule() -> None:
+    for link in ARM.description.links:
+        for shape in link.collisions:
+            assert covering_capsules(link.name, shape) == (enclosing_capsule(link.name, shape),)
+
+
+def test_a_flat_plate_stays_flat() -> None:
+    plate = Primitive("box", (100.0, 100.0, 10.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert enclosing_capsule("link", plate).radius_mm > 45.0
+    capsules = covering_capsules("link", plate)
+    assert len(capsules) < 6
+    assert max(capsule.radius_mm for capsule in capsules) < 5.0 + COVER_MM
 
 
 @pytest.mark.parametrize("shape", SHAPES)

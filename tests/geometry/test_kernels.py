@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marl_handover.geometry.capsules import segment_distance
+from marl_handover.geometry.capsules import block_capsules, segment_distance
 from marl_handover.geometry.kernels import (
     at_wrist,
     broad_phase,
@@ -22,7 +22,7 @@ from marl_handover.geometry.kernels import (
     jacobian_transpose,
     place_capsules,
 )
-from marl_handover.motion.collision_model import CollisionModel, block_capsules, out_of_reach
+from marl_handover.motion.collision_model import CollisionModel, out_of_reach
 
 
 def postures(model, count, seed):
@@ -35,7 +35,7 @@ def placed(body: CollisionModel, q):
     """Frames and placed capsules of one posture."""
     frames, ends = np.empty((1, 5, 4)), np.empty((len(body.held), 10))
     forward_kinematics(body.planar, q[None], 0, frames, 0)
-    place_capsules(body.held, frames, 0, ends)
+    place_capsules(body.held, q[0], frames, 0, ends)
     return frames, ends
 
 

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marl_handover.geometry.capsules import Capsule, capsule_pairs, segment_distance, self_clearance_mm
+from marl_handover.geometry.capsules import Capsule, block_capsules, capsule_pairs, segment_distance, self_clearance_mm
 from marl_handover.geometry.se3 import transform
 from marl_handover.hardware.clearance import FAR_MM, SETTLED_MM, alone_mm, arm_shapes, between_mm, still
-from marl_handover.motion.collision_model import block_capsules
 
 
 @pytest.fixture(scope="module")

@@ -235,7 +235,7 @@ class FreePaths:
     def _around_block(self, arm: int, block_mm: Floats, ends: Floats, profile: Floats) -> Segment:
         """A way of the empty hand past a block that lies at a world position."""
         empty = self._empty[arm]
-        block = standing_block(self.planner.model, self.motion, self.planner.in_base(arm, block_mm))
+        block = standing_block(self.planner.collision_models[arm], self.planner.model, self.planner.in_base(arm, block_mm))
         obstacles = np.concatenate([empty.scene.obstacles[: empty.scene.arm_rows], block])
         scene = empty.scene._replace(obstacles=obstacles, group=ball_around(obstacles), profile=profile)
         return replace(empty, ends=ends, scene=scene)
