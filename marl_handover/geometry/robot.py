@@ -12,6 +12,7 @@ from marl_handover.errors import MissingFile, UnknownChoice
 from marl_handover.files import expanded, resource_path
 from marl_handover.geometry.capsules import touching_links
 from marl_handover.geometry.closed_form import ClosedFormArm
+from marl_handover.geometry.link_shapes import with_shapes
 from marl_handover.geometry.urdf import read_urdf
 
 _YAML = (".yaml", ".yml")
@@ -68,5 +69,7 @@ def read_robot(config: RobotConfig, limits_deg: Mapping[str, Sequence[float]] | 
     description = read_urdf(config.urdf, config.tip or "grip")
     limits = {**config.joint_limits_deg, **(limits_deg or {})}
     arm = ClosedFormArm(description, limits)
+    shaped = with_shapes(arm, config.shapes)
+    arm = arm if shaped is description else ClosedFormArm(shaped, limits)
     ignored = touching_links(arm, MotionConfig())
-    return ClosedFormArm(replace(description, ignored=ignored), limits) if ignored else arm
+    return ClosedFormArm(replace(shaped, ignored=ignored), limits) if ignored else arm

@@ -42,3 +42,11 @@ def apply(T: Floats, points_mm: ArrayLike) -> Floats:
     if points.ndim == 1:
         return np.asarray(T[..., :3, :3] @ points + T[..., :3, 3])
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def rpy_of(R: Floats) -> tuple[float, float, float]:
+    """The roll, pitch and yaw in rad of a rotation (3, 3), as :func:`transform` takes them."""
+    pitch = math.atan2(-R[2, 0], math.hypot(R[0, 0], R[1, 0]))
+    if math.hypot(R[0, 0], R[1, 0]) < 1e-9:  # roll and yaw turn about one axis: all of it is roll
+        return math.atan2(-R[1, 2], R[1, 1]), pitch, 0.0
+    return math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])

@@ -96,7 +96,7 @@ def arm_collision_model(model: CellModel, motion: MotionConfig, index: int) -> C
     planar = arm.planar
     shapes, first, second = capsule_pairs(arm.description)
     if not shapes:
-        raise UrdfError(arm.description.path, "no link has a collision shape, and motions need them")
+        raise UrdfError(arm.description.path, "no link has a collision shape, and motions need them; set shapes=links")
     pivots = np.array([[0.0, 0.0], [0.0, 0.0], arm.shoulder_mm, arm.shoulder_mm + arm.upper_arm_mm])
     pivots = np.concatenate([pivots, [pivots[3] + arm.forearm_mm]])
     frames = arm.link_transforms(np.zeros(5), motion.finger_travel_mm)
