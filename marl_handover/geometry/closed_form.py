@@ -22,6 +22,7 @@ from marl_handover.geometry.se3 import rotation, transform
 from marl_handover.geometry.urdf import ARM_JOINTS, ArmDescription, Joint, Vector
 
 _GEOMETRY_TOLERANCE = 1e-6  # mm or a unit vector's components: well below any machining, well above float rounding
+_RING_STEP_MM = 1.0
 _AXES: dict[str, Vector] = {
     "base_yaw": (0.0, 0.0, 1.0),
     "shoulder": (0.0, -1.0, 0.0),
@@ -56,7 +57,9 @@ class ClosedFormArm:
         vectors = (self.upper_arm_mm, self.forearm_mm, self.tool_mm)
         self.planar = _frozen(np.concatenate([self.shoulder_mm, *vectors, [self.lateral_mm]]))
         self.reach_mm = math.hypot(abs(float(self.shoulder_mm[0])) + sum(math.hypot(*vector) for vector in vectors), self.lateral_mm)
+        self._roll_axis = description.joint("wrist_roll").axis
         self._origins = {joint.name: transform(joint.xyz_mm, joint.rpy_rad) for joint in description.joints}
+        self._beside_roll_mm = _frozen(_off_axis(description, grip_mm))
 
     def fk(self, q: ArrayLike) -> Floats:
         """Grasp frames T_base_grip (..., 4, 4) in mm of joint vectors ``q`` (..., 5) in rad."""
@@ -99,19 +102,40 @@ class ClosedFormArm:
     def ik(self, position_mm: ArrayLike, pitch_rad: ArrayLike = 0.0, roll_rad: ArrayLike = 0.0) -> Floats:
         """Joint vectors (..., 2, 5) in rad that put the grip at ``position_mm`` (..., 3), base frame, turned to face that point.
 
-        ``pitch_rad`` and ``roll_rad`` broadcast against the leading dimensions. Branch 0 bends the forearm down (elbow
+        A grip beside the arm's plane passes over the point: yaw = atan2(y, x) - asin(lateral / distance). ``pitch_rad``, counted from
+        the pick pitch, and ``roll_rad`` broadcast against the leading dimensions. Branch 0 bends the forearm down (elbow
         up), branch 1 bends it up. A row is NaN where the point is out of reach; joint limits are left to :meth:`within_limits`.
         """
         position = np.asarray(position_mm, dtype=float)
         shape = np.broadcast_shapes(position.shape[:-1], np.shape(pitch_rad), np.shape(roll_rad))
         pitch, roll = np.broadcast_to(np.asarray(pitch_rad, dtype=float), shape), np.broadcast_to(np.asarray(roll_rad, dtype=float), shape)
         x, y, z = (np.broadcast_to(position[..., axis], shape) for axis in range(3))
-        radius, yaw = into_plane(self.planar, np.hypot(x, y), np.arctan2(y, x))
+        radius, yaw, planar = np.hypot(x, y), np.arctan2(y, x), self.planar
+        if self._beside_roll_mm.any() and np.any(roll != 0.0):
+            # The roll moves the grip: a planar arm without tool reaches for where the wrist has to be.
+            tool_r, left, tool_z = self._rolled_tool_mm(roll)
+            share = left / np.where(radius >= np.abs(left), radius, math.nan)
+            radius, yaw = radius * np.sqrt(1 - share * share) - (np.cos(pitch) * tool_r - np.sin(pitch) * tool_z), yaw - np.arcsin(share)
+            planar, z = np.concatenate([planar[:6], np.zeros(3)]), z - (np.sin(pitch) * tool_r + np.cos(pitch) * tool_z)
+        else:
+            radius, yaw = into_plane(planar, radius, yaw)
         branches = []
         for elbow in (-1, 1):
-            pitches = planar_ik(self.planar, radius, z, pitch, elbow)
+            pitches = planar_ik(planar, radius, z, pitch, elbow)
             branches.append(self._nearest_turn(np.concatenate([yaw[..., None], pitches, roll[..., None]], axis=-1)))
         return np.stack(branches, axis=-2)
+
+    def ring_mm(self, height_mm: float, pitch_rad: float = 0.0) -> tuple[float, float] | None:
+        """Least and greatest distance from the yaw axis of the grip at a height, by joint limits alone; None where there is no such ring.
+
+        ``pitch_rad`` is counted from the pick pitch. Of several rings the widest.
+        """
+        return ring_by_limits_mm(self.planar, np.stack([self.lower_rad, self.upper_rad], axis=1), height_mm, pitch_rad)
+
+    def _rolled_tool_mm(self, roll: Floats) -> tuple[Floats, Floats, Floats]:
+        """The grip from the wrist, ahead, to the left of the plane and up (...), with the hand rolled; the other joints at zero."""
+        moved = rotation(roll, self._roll_axis) @ self._beside_roll_mm - self._beside_roll_mm
+        return self.tool_mm[0] + moved[..., 0], self.lateral_mm + moved[..., 1], self.tool_mm[1] + moved[..., 2]
 
     def within_limits(self, q: ArrayLike) -> Bools:
         """Whether joint vectors ``q`` (..., 5) are within the joint limits, up to :data:`LIMIT_TOLERANCE_RAD`; shape (...). NaN is not."""
@@ -220,6 +244,38 @@ def planar_ik(planar: Array, r: Array, z: Array, pitch: Array, elbow: int) -> Ar
     return xp.stack([shoulder, bent, pitch - shoulder - bent], -1)
 
 
+def ring_by_limits_mm(planar: Floats, limits_rad: Floats, height_mm: float, pitch_rad: float) -> tuple[float, float] | None:
+    """Least and greatest distance from the yaw axis of a grip at one height and pitch, joints within ``limits_rad`` (5, 2).
+
+    The elbow bends one way all over the ring, and the wrist is in front of the yaw axis. Of several rings the widest, to 0.01 mm; None
+    where there is none.
+    """
+    cos, sin = math.cos(pitch_rad), math.sin(pitch_rad)
+    nearest = max(0.0, cos * float(planar[6]) - sin * float(planar[7]))
+    farthest = abs(float(planar[0])) + sum(math.hypot(*planar[k : k + 2]) for k in (2, 4, 6))
+    coarse = np.arange(nearest, max(farthest, nearest) + _RING_STEP_MM, _RING_STEP_MM)
+    best: tuple[float, float] | None = None
+    for elbow in (-1, 1):
+        good = _in_limits(planar, limits_rad, coarse, height_mm, pitch_rad, elbow)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]]))).reshape(-1, 2)
+        for first, last in edges:
+            ends = []
+            for inside, outside in ((first, max(first - 1, 0)), (last - 1, min(last, len(coarse) - 1))):
+                fine = np.linspace(coarse[inside], coarse[outside], round(_RING_STEP_MM / 0.01) + 1)
+                held = _in_limits(planar, limits_rad, fine, height_mm, pitch_rad, elbow)
+                ends.append(float(fine[-1] if held.all() else fine[int(np.argmin(held)) - 1]))
+            if best is None or ends[1] - ends[0] > best[1] - best[0] + _RING_STEP_MM:
+                best = (ends[0], ends[1])
+    return None if best is None else (math.hypot(best[0], planar[8]), math.hypot(best[1], planar[8]))
+
+
+def _in_limits(planar: Floats, limits_rad: Floats, r_mm: Floats, height_mm: float, pitch_rad: float, elbow: int) -> Bools:
+    """Whether an elbow bent that way reaches (r_mm (n,), height) within the limits (5, 2) of the pitch joints: (n,)."""
+    q = wrap(planar_ik(planar, r_mm, np.full_like(r_mm, height_mm), np.full_like(r_mm, pitch_rad), elbow))
+    low, high = (limits_rad[1:4, side] + slack for side, slack in ((0, -LIMIT_TOLERANCE_RAD), (1, LIMIT_TOLERANCE_RAD)))
+    return np.asarray(np.any([(q + turn >= low) & (q + turn <= high) for turn in (0.0, 2 * math.pi, -2 * math.pi)], axis=0).all(axis=-1))
+
+
 def _frozen(values: Floats) -> Floats:
     values = np.array(values, dtype=float)
     values.setflags(write=False)
@@ -247,33 +303,45 @@ def _limits(description: ArmDescription, limits_deg: Mapping[str, Sequence[float
 def _check_class(description: ArmDescription) -> tuple[list[Floats], Floats]:
     """In-plane origins (x, z) in mm at zero of the five joints, and the grip's (3,).
 
-    Raises :class:`UnsupportedKinematics` unless yaw, three parallel pitch joints and roll follow each other in one plane, frames unturned.
+    Raises :class:`UnsupportedKinematics` unless yaw, three parallel pitch joints in one plane and roll follow each other, frames unturned.
     """
     T = np.eye(4)
     origins: list[Floats] = []
     for joint in description.chain():
         T = T @ transform(joint.xyz_mm, joint.rpy_rad)
         where = f"joint {joint.name!r}"
-        if not np.allclose(T[:3, :3], np.eye(3), atol=_GEOMETRY_TOLERANCE):
-            _unsupported(description, f"{where} turns its frame by rpy = {joint.rpy_rad} rad; at zero all frames must be parallel")
         if joint.kind == "fixed":
             continue
+        if not np.allclose(T[:3, :3], np.eye(3), atol=_GEOMETRY_TOLERANCE):
+            _unsupported(description, f"{where} turns its frame by rpy = {joint.rpy_rad} rad; at zero all frames must be parallel")
         if joint.kind == "prismatic":
             _unsupported(description, f"{where} is prismatic; it must be revolute")
-        if not np.allclose(joint.axis, _AXES[joint.name], atol=_GEOMETRY_TOLERANCE):
+        rolls = joint.name == "wrist_roll" and joint.axis[0] > 0 and abs(joint.axis[1]) < _GEOMETRY_TOLERANCE  # along a hand that may tilt
+        if not rolls and not np.allclose(joint.axis, _AXES[joint.name], atol=_GEOMETRY_TOLERANCE):
             _unsupported(description, f"{where} has axis {joint.axis}; it must be {_AXES[joint.name]}")
-        if abs(T[1, 3]) > _GEOMETRY_TOLERANCE:
+        if not rolls and abs(T[1, 3]) > _GEOMETRY_TOLERANCE:
             _unsupported(description, f"{where} is {T[1, 3]:g} mm off the arm's plane y = 0")
         origins.append(T[[0, 2], 3])
     if abs(origins[0][0]) > _GEOMETRY_TOLERANCE:
         _unsupported(description, f"joint 'base_yaw' is {origins[0][0]:g} mm off the base frame's z axis")
-    grip_mm = T[:3, 3]
-    if abs(grip_mm[2] - origins[4][1]) > _GEOMETRY_TOLERANCE:
-        _unsupported(description, f"link {description.grasp_link!r} is off the axis of joint 'wrist_roll', so that rolling would move it")
+    if not np.allclose(T[:3, :3], np.eye(3), atol=_GEOMETRY_TOLERANCE):
+        _unsupported(description, f"link {description.grasp_link!r} is turned; at zero all frames must be parallel")
     for name, vector in (("shoulder to elbow", origins[2] - origins[1]), ("elbow to wrist_pitch", origins[3] - origins[2])):
         if math.hypot(*vector) < _GEOMETRY_TOLERANCE:
             _unsupported(description, f"the link from {name} has no length")
-    return origins, grip_mm
+    return origins, T[:3, 3]
+
+
+def _off_axis(description: ArmDescription, grip_mm: Floats) -> Floats:
+    """How far the grip is off the roll axis at zero: (3,) mm, square to the axis; zeros where rolling does not move it."""
+    T, roll = np.eye(4), description.joint("wrist_roll")
+    for joint in description.chain():
+        T = T @ transform(joint.xyz_mm, joint.rpy_rad)
+        if joint is roll:
+            break
+    axis, beside = np.asarray(roll.axis), grip_mm - T[:3, 3]
+    beside = beside - axis * float(beside @ axis)
+    return np.zeros(3) if math.hypot(*beside) < _GEOMETRY_TOLERANCE else beside
 
 
 def _unsupported(description: ArmDescription, what: str) -> None:

@@ -46,12 +46,13 @@ def with_shapes(arm: ClosedFormArm, shapes: str) -> ArmDescription:
 
 def _of_file(description: ArmDescription) -> ArmDescription:
     links, notes = [], []
+    has_shapes = any(link.collisions or link.meshes for link in description.links)  # else it is asked for them, where they are needed
     for link in description.links:
         if link.collisions and not link.meshes:
             links.append(link)
             continue
         solid: Sequence[Primitive | Mesh] = (*link.collisions, *link.meshes)
-        if not solid and link.visuals:
+        if not solid and link.visuals and has_shapes:
             solid = [visual.shape for visual in link.visuals]
             notes.append(f"shapes: link {link.name!r} has no collision shape; what it looks like is taken")
         if solid:

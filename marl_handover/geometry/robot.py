@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +9,11 @@ from marl_handover.compose import from_yaml, option_names
 from marl_handover.config import MotionConfig, RobotConfig
 from marl_handover.errors import MissingFile, UnknownChoice
 from marl_handover.files import expanded, resource_path
+from marl_handover.geometry.canonical import canonical_arm, require_moving
 from marl_handover.geometry.capsules import touching_links
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.link_shapes import with_shapes
-from marl_handover.geometry.urdf import read_urdf
+from marl_handover.geometry.urdf import ArmDescription, read_urdf
 
 _YAML = (".yaml", ".yml")
 
@@ -55,21 +55,22 @@ def urdf_path(urdf: str) -> Path:
         raise MissingFile("URDF", urdf, f"name a file here, a path, or one of those that are shipped: {shipped}") from error
 
 
-def read_robot(config: RobotConfig, limits_deg: Mapping[str, Sequence[float]] | None = None) -> ClosedFormArm:
-    """The kinematics of a robot.
-
-    Args:
-        config: its settings, ``urdf`` a path.
-        limits_deg: role -> [lower, upper] in degrees, in place of the robot's own.
+def read_robot(config: RobotConfig) -> ClosedFormArm:
+    """The kinematics of a robot, by its settings.
 
     Raises:
         MissingFile, UrdfError, UnsupportedKinematics: of a URDF that is none, or of another class.
         UnknownKey, InvalidSetting: of limits.
     """
-    description = read_urdf(config.urdf, config.tip or "grip")
-    limits = {**config.joint_limits_deg, **(limits_deg or {})}
+    description, limits = describe(config), config.joint_limits_deg
+    require_moving(description, config)
     arm = ClosedFormArm(description, limits)
     shaped = with_shapes(arm, config.shapes)
     arm = arm if shaped is description else ClosedFormArm(shaped, limits)
     ignored = touching_links(arm, MotionConfig())
     return ClosedFormArm(replace(shaped, ignored=ignored), limits) if ignored else arm
+
+
+def describe(config: RobotConfig) -> ArmDescription:
+    """A robot as the canonical arm. Raises as :func:`~marl_handover.geometry.canonical.canonical_arm` does."""
+    return canonical_arm(read_urdf(config.urdf), config)

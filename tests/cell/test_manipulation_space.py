@@ -12,13 +12,12 @@ from hypothesis import strategies as st
 from marl_handover.cell.reach import ManipulationGrid, feasible, fit_annulus, manipulation_grid
 from marl_handover.config import CellConfig
 from marl_handover.errors import InvalidSetting
-from marl_handover.files import resource_path
 from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
 from marl_handover.geometry.closed_form import ClosedFormArm
+from marl_handover.geometry.robot import describe, robot_config
 from marl_handover.geometry.se2 import SE2
-from marl_handover.geometry.urdf import read_urdf
 
-DESCRIPTION = read_urdf(resource_path("urdf/al5a.urdf"))
+DESCRIPTION = describe(robot_config("al5a"))
 PAPER = {"base_yaw": [-90, 90], "shoulder": [-14, 150], "elbow": [-168, -108.5], "wrist_pitch": [-95, 95], "wrist_roll": [-90, 90]}
 AL5A = {"base_yaw": [-95, 95], "shoulder": [-14, 150], "elbow": [-167, 0], "wrist_pitch": [-95, 100], "wrist_roll": [-90, 90]}
 PAPER_ARM = ClosedFormArm(DESCRIPTION, PAPER)

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from marl_handover.files import resource_path
 from marl_handover.geometry.capsules import (
     COVER_MM,
     MOST_CAPSULES,
@@ -21,10 +20,11 @@ from marl_handover.geometry.capsules import (
     self_clearance_mm,
 )
 from marl_handover.geometry.closed_form import ClosedFormArm
+from marl_handover.geometry.robot import describe, robot_config
 from marl_handover.geometry.se3 import transform
-from marl_handover.geometry.urdf import Primitive, read_urdf
+from marl_handover.geometry.urdf import Primitive
 
-ARM = ClosedFormArm(read_urdf(resource_path("urdf/al5a.urdf")))
+ARM = ClosedFormArm(describe(robot_config("al5a")))
 LINKS = {link.name: link for link in ARM.description.links}
 BODIES = [["base_link"], ["turret"], ["upper_arm"], ["forearm"], ["wrist"], ["hand", "finger_left_link", "finger_right_link"]]
 Floats = NDArray[np.float64]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,14 +13,13 @@ from hypothesis import strategies as st
 
 from marl_handover.arrays import wrap
 from marl_handover.errors import InvalidSetting, UnknownKey, UnsupportedKinematics
-from marl_handover.files import resource_path
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.closed_form import ClosedFormArm, grip_in_plane, grip_speed, into_plane, out_of_plane, planar_ik
+from marl_handover.geometry.robot import describe, robot_config
 from marl_handover.geometry.se3 import rotation, transform
-from marl_handover.geometry.urdf import ARM_JOINTS, ArmDescription, read_urdf
+from marl_handover.geometry.urdf import ARM_JOINTS, ArmDescription
 
-SHIPPED = resource_path("urdf/al5a.urdf")
-DESCRIPTION = read_urdf(SHIPPED)
+DESCRIPTION = describe(robot_config("al5a"))
 WIDE = {name: [-179.0, 179.0] for name in ARM_JOINTS}
 
 
@@ -178,25 +176,21 @@ def test_unknown_joint_is_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("joint", "changes", "message"),
     [
-        ('<axis xyz="0 -1 0"/>', '<axis xyz="0 1 0"/>', "joint 'shoulder' has axis (0.0, 1.0, 0.0)"),
-        ('<axis xyz="0 0 1"/>', '<axis xyz="1 0 0"/>', "joint 'base_yaw' has axis"),
-        ('xyz="0.094 0 0" rpy="0 0 0"', 'xyz="0.094 0 0" rpy="0 0 0.1"', "joint 'elbow' turns its frame"),
-        ('xyz="0.094 0 0"', 'xyz="0.094 0.003 0"', "joint 'elbow' is 3 mm off the arm's plane"),
-        ('xyz="0 0 0.024" rpy="0 0 0"', 'xyz="0.002 0 0.024" rpy="0 0 0"', "joint 'base_yaw' is 2 mm off"),
-        ('xyz="0.064 0 0"', 'xyz="0.064 0 0.004"', "off the axis of joint 'wrist_roll'"),
-        ('xyz="0.106 0 0"', 'xyz="0 0 0"', "has no length"),
-        ('<joint name="wrist_pitch" type="revolute">', '<joint name="wrist_pitch" type="prismatic">', "'wrist_pitch' is prismatic"),
+        ("shoulder", {"axis": (0.0, 1.0, 0.0)}, "joint 'shoulder' has axis (0.0, 1.0, 0.0)"),
+        ("base_yaw", {"axis": (1.0, 0.0, 0.0)}, "joint 'base_yaw' has axis"),
+        ("elbow", {"rpy_rad": (0.0, 0.0, 0.1)}, "joint 'elbow' turns its frame"),
+        ("elbow", {"xyz_mm": (94.0, 3.0, 0.0)}, "joint 'elbow' is 3 mm off the arm's plane"),
+        ("base_yaw", {"xyz_mm": (2.0, 0.0, 24.0)}, "joint 'base_yaw' is 2 mm off"),
+        ("wrist_pitch", {"xyz_mm": (0.0, 0.0, 0.0)}, "has no length"),
+        ("wrist_pitch", {"kind": "prismatic"}, "'wrist_pitch' is prismatic"),
     ],
 )
-def test_another_kinematic_class_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
-    text = SHIPPED.read_text(encoding="utf-8")
-    assert old in text
-    path = tmp_path / "other.urdf"
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+def test_a_description_that_is_not_canonical_is_refused(joint: str, changes: dict[str, object], message: str) -> None:
+    joints = tuple(replace(each, **changes) if each.name == joint else each for each in DESCRIPTION.joints)
     with pytest.raises(UnsupportedKinematics) as caught:
-        ClosedFormArm(read_urdf(path))
+        ClosedFormArm(replace(DESCRIPTION, joints=joints))
     assert message in str(caught.value)
 
 

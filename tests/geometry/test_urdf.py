@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from marl_handover.errors import MissingFile, UrdfError
 from marl_handover.files import resource_path
+from marl_handover.geometry.robot import describe, robot_config
 from marl_handover.geometry.urdf import ARM_JOINTS, read_urdf
 
 SHIPPED = resource_path("urdf/al5a.urdf")
@@ -23,17 +25,8 @@ def without(tag: str, name: str) -> str:
     return ET.tostring(robot, encoding="unicode")
 
 
-def swapped() -> str:
-    """The shipped URDF with shoulder and elbow listed in the wrong order."""
-    robot = ET.fromstring(TEXT)
-    shoulder = next(joint for joint in robot.findall("joint") if joint.get("name") == "shoulder")
-    robot.remove(shoulder)
-    robot.append(shoulder)
-    return ET.tostring(robot, encoding="unicode")
-
-
 def test_shipped_arm_has_the_measured_geometry_in_mm() -> None:
-    arm = read_urdf(SHIPPED)
+    arm = describe(robot_config("al5a"))
     assert tuple(joint.name for joint in arm.chain() if joint.kind != "fixed") == ARM_JOINTS
     x_mm = sum(joint.xyz_mm[0] for joint in arm.chain())
     z_mm = sum(joint.xyz_mm[2] for joint in arm.chain())
@@ -43,7 +36,7 @@ def test_shipped_arm_has_the_measured_geometry_in_mm() -> None:
 
 
 def test_fingers_are_prismatic_in_mm_and_part_sideways() -> None:
-    arm = read_urdf(SHIPPED)
+    arm = describe(robot_config("al5a"))
     left, right = arm.joint("finger_left"), arm.joint("finger_right")
     assert (left.kind, right.kind) == ("prismatic", "prismatic")
     assert (left.lower, left.upper) == pytest.approx((0, 16)) == (right.lower, right.upper)
@@ -69,9 +62,8 @@ def test_inertias_are_those_of_a_possible_body() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (without("link", "grip").replace('"grip"', '"tip"'), "link 'grip'"),
-        (without("joint", "elbow"), "joint 'elbow' is missing"),
-        (swapped(), "come in the order base_yaw, elbow"),
+        (without("link", "grip").replace('"grip"', '"tip"'), "'tip', which is missing"),
+        (without("joint", "elbow"), "2 links without a parent (base_link, forearm)"),
         (TEXT.replace("<robot", '<!DOCTYPE robot [<!ENTITY x "y">]><robot', 1), "DOCTYPE"),
         (TEXT.replace('xyz="0.094 0 0"', 'xyz="nan 0 0"'), "nan 0 0"),
         (TEXT.replace('xyz="0.094 0 0"', 'xyz="0.094 0"'), "it must have 3"),
@@ -80,12 +72,24 @@ def test_inertias_are_those_of_a_possible_body() -> None:
         (TEXT.replace('velocity="9.5"', ""), "lacks its 'velocity'"),
         (TEXT.replace('lower="-1.65806" upper="1.65806"', 'lower="1" upper="-1"'), "lower limit above"),
         (TEXT.replace('<limit lower="-1.65806" upper="1.65806" effort="0.59" velocity="5.8"/>', ""), "joint 'base_yaw' lacks its <limit>"),
-        (TEXT.replace('<box size="0.084 0.022 0.016"/>', '<mesh filename="a.stl"/>'), "<mesh>"),
+        (TEXT.replace('<box size="0.084 0.022 0.016"/>', "<mesh/>"), "lacks its 'filename'"),
+        (TEXT.replace('<mass value="0.19"/>', '<mass value="-0.19"/>'), "link 'forearm' has a mass of -0.19 kg"),
+        (TEXT.replace('type="prismatic"', 'type="planar"', 1), "joint 'finger_left' has type 'planar'"),
+        (
+            TEXT.replace("<robot", '<robot xmlns:xacro="http://ros.org/xacro"').replace("</robot>", "<xacro:arm/></robot>"),
+            "run xacro first: xacro faulty.urdf",
+        ),
+        (TEXT.replace("</robot>", "<xacro:arm/></robot>"), "run xacro first"),
+        (TEXT.replace('xyz="0.094 0 0"', 'xyz="${length} 0 0"'), "run xacro first"),
+        (TEXT.replace("<link", "\n<<<<<<< HEAD\n<link", 1), "is a marker of an unfinished merge"),
+        ("<sdf version='1.6'/>", "this is an SDF"),
+        ("<mujoco/>", "this is an MJCF"),
+        (TEXT.replace('velocity="0.095"/>', 'velocity="0.095"/><mimic joint="thumb"/>', 1), "mimics joint 'thumb', which is missing"),
+        (TEXT.replace('velocity="0.095"/>', 'velocity="0.095"/><mimic joint="finger_left"/>', 1), "mimics itself"),
         (TEXT.replace('<box size="0.084 0.022 0.016"/>', '<box size="0.084 0 0.016"/>'), "not above 0"),
         (TEXT.replace('<parent link="hand"/>', '<parent link="nowhere"/>', 1), "'nowhere', which is missing"),
         (TEXT.replace('<child link="finger_left_link"/>', '<child link="hand"/>'), "child link 'hand' is there 2 times"),
         (TEXT.replace('<parent link="wrist"/>', '<parent link="grip"/>'), "part of a loop"),
-        (TEXT.replace('<parent link="wrist"/>', '<parent link="forearm"/>'), "the joints from 'base_link' to 'grip' are"),
         (TEXT[:-20], "malformed XML"),
         ("<model/>", "must be <robot>"),
         ("", "malformed XML"),
@@ -113,6 +117,6 @@ def test_missing_file_is_named(tmp_path: Path) -> None:
         read_urdf(tmp_path / "none.urdf")
 
 
-def test_another_grasp_link_is_looked_for() -> None:
-    with pytest.raises(UrdfError, match="'claw'.*set grasp_link"):
-        read_urdf(SHIPPED, grasp_link="claw")
+def test_another_tip_is_looked_for() -> None:
+    with pytest.raises(UrdfError, match="link 'claw', the tip, is missing; it has: .*grip"):
+        describe(replace(robot_config("al5a"), tip="claw"))
