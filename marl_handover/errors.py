@@ -94,6 +94,16 @@ class HandoverError(Exception):
 
     exit_status = 2
 
+    def __reduce__(self) -> Any:
+        """What workers raise says the same here: an error is made anew of its message, not of what its constructor takes."""
+        return _restored, (type(self), self.args, self.__dict__)
+
+
+def _restored(kind: type[HandoverError], arguments: tuple[Any, ...], attributes: dict[str, Any]) -> HandoverError:
+    error = kind.__new__(kind, *arguments)
+    error.__dict__.update(attributes)
+    return error
+
 
 class WorkFailed(HandoverError):
     """The input was fine, but the work could not be done."""

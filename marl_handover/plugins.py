@@ -1,7 +1,7 @@
 """Names that can be added to: algorithms, backends, policies, observation layouts. Each is one Python file, found by its name.
 
 A file adds a name with ``register`` of the :class:`Registry` that it belongs to. Files of your own are listed in the environment
-variable ``MARL_HANDOVER_PLUGINS``, which ``plugins=`` of every command sets; worker processes inherit it.
+variable ``MARL_HANDOVER_PLUGINS``, which ``plugins=`` of every command sets; worker processes are told of it by a :class:`Parcel`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
+
+import cloudpickle
 
 from marl_handover.errors import CorruptFile, HandoverError, MissingFile, UnknownChoice, first_line
 from marl_handover.files import expanded
@@ -115,9 +117,24 @@ def added(paths: Iterable[str]) -> Iterator[None]:
             os.environ[VARIABLE] = before
 
 
-def load_plugins() -> None:
-    """Import the files that :data:`VARIABLE` lists, each once in a process."""
-    listed = os.environ.get(VARIABLE, "")
+class Parcel:
+    """A function without arguments for another process, of this machine or another: that knows the same plugins before it unpacks it.
+
+    What a plugin defines can be unpacked only where its file was imported, so a parcel holds bytes, and the list of the files.
+    """
+
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self._listed, self._packed = os.environ.get(VARIABLE, ""), cloudpickle.dumps(function)
+
+    def __call__(self) -> Any:
+        """What the function returns. Raises what it raises, and as :func:`added`."""
+        load_plugins(self._listed)
+        return cloudpickle.loads(self._packed)()
+
+
+def load_plugins(listed: str | None = None) -> None:
+    """Import the files that are ``listed``, else those of :data:`VARIABLE`, each once in a process."""
+    listed = os.environ.get(VARIABLE, "") if listed is None else listed
     for name in filter(None, listed.split(os.pathsep)) if listed else ():
         if name not in _loaded:
             _loaded.add(name)  # before it is imported: it looks names up itself

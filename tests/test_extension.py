@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import pickle
+import subprocess
+import sys
 
 import pytest
 
@@ -182,3 +185,27 @@ def test_a_plugin_that_cannot_be_loaded_is_told_in_one_line(write, tmp_path, cap
     err = capsys.readouterr().err
     assert said in err
     assert len(err.splitlines()) == 1
+
+
+IN_WORKERS = (
+    *("source=aec", "workers=2", "compile=off", "progress=false", "num_envs=4", "steps=64", "evaluation_interval=64"),
+    *("evaluation_episodes=10", "algorithm.hidden=[16]", "algorithm.learning_starts=32", "algorithm.batch_size=16"),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("collector", ["multiprocess", "ray"])
+def test_collecting_workers_know_an_algorithm_too(write, tmp_path, collector):
+    if collector == "ray":
+        pytest.importorskip("ray")
+    file, run = write("bolder.py", ALGORITHM), tmp_path / "run"
+    assert main(["train", f"plugins={file}", "algorithm=bolder", f"collector={collector}", f"out={run}", *IN_WORKERS]) == 0
+    assert evaluated(tmp_path, f"plugins={file}", f"policy={run}")["episodes"] == 40
+
+
+def test_what_a_parcel_holds_is_unpacked_where_its_plugins_are_known(write):
+    with plugins.added([write("bolder.py", ALGORITHM)]):
+        parcel = plugins.Parcel(lambda: ALGORITHMS["bolder"](boldness=4.0).boldness)
+    code = "import pickle, sys; print(pickle.load(sys.stdin.buffer)())"
+    found = subprocess.run([sys.executable, "-c", code], input=pickle.dumps(parcel), capture_output=True)
+    assert found.stdout.split() == [b"4.0"], found.stderr

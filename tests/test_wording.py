@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marl_handover.errors import counted
+from marl_handover.errors import CorruptFile, counted
 from marl_handover.viewer.words import degrees_words, place_words
 
 SOURCES = sorted((Path(__file__).resolve().parents[1] / "marl_handover").rglob("*.py"))
@@ -36,3 +37,9 @@ def test_one_is_not_many():
 def test_nothing_is_minus_nothing(length_mm, angle_rad):
     assert place_words((length_mm, -length_mm)) == "(0, 0) mm"
     assert degrees_words(angle_rad) == "0°"
+
+
+def test_an_error_of_another_process_says_the_same_and_keeps_its_attributes():
+    error = CorruptFile("plugin", Path("mine.py"), "SyntaxError")
+    other = pickle.loads(pickle.dumps(error))
+    assert (type(other), str(other), vars(other)) == (CorruptFile, str(error), vars(error))

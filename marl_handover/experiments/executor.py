@@ -22,6 +22,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,7 +32,7 @@ from joblib.parallel import LokyBackend, ParallelBackendBase
 
 from marl_handover.cluster import ClusterUnavailable, connected, require_ray
 from marl_handover.config import require_at_least, require_choice
-from marl_handover.plugins import load_plugins
+from marl_handover.plugins import Parcel
 from marl_handover.progress import Bar
 
 WATCH_S = 1.0
@@ -49,12 +50,10 @@ class Outcome:
     worker_died: bool = False
 
 
-def attempt(index: int, parcel: bytes) -> Outcome:
-    """Unpack a function and its argument, call it, pack the result. Whatever goes wrong in any of it is this item's outcome."""
+def attempt(index: int, parcel: Parcel) -> Outcome:
+    """Do what is in a parcel and pack the result. Whatever goes wrong in any of it is this item's outcome."""
     try:
-        load_plugins()  # whose classes the parcel may hold
-        function, item = cloudpickle.loads(parcel)
-        return Outcome(index, cloudpickle.dumps(function(item)))
+        return Outcome(index, cloudpickle.dumps(parcel()))
     except (Exception, SystemExit) as error:
         return Outcome(index, None, summary(error), "".join(traceback.format_exception(error)))
 
@@ -66,7 +65,7 @@ def summary(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}{place}".split())
 
 
-def run_parallel(backend: ParallelBackendBase, parcels: Mapping[int, bytes], workers: int, at_once: int) -> Generator[Outcome, None, None]:
+def run_parallel(backend: ParallelBackendBase, parcels: Mapping[int, Parcel], workers: int, at_once: int) -> Generator[Outcome, None, None]:
     """One joblib call: the outcome of each parcel as it is done, ``at_once`` of them at the same time."""
     parallel = Parallel(n_jobs=workers, backend=backend, batch_size=1, pre_dispatch=at_once, return_as="generator_unordered")
     with warnings.catch_warnings():
@@ -135,7 +134,7 @@ LOG = logging.getLogger(__name__)
 
 
 def through_ray(
-    parcels: Mapping[int, bytes], names: list[str], address: str, jobs: int, attempts: int, ready: Callable[[], None]
+    parcels: Mapping[int, Parcel], names: list[str], address: str, jobs: int, attempts: int, ready: Callable[[], None]
 ) -> Generator[Outcome, None, None]:
     """The outcome of each parcel as it is done, on the cluster at ``address``; see :func:`marl_handover.experiments.executor.fan_out`."""
     if not parcels:
@@ -235,7 +234,6 @@ def _call(batch: Any) -> list[Outcome]:
 
 
 LAUNCHERS = ("loky", "ray")
-LOG = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -297,11 +295,9 @@ def fan_out(
     require_at_least("jobs", jobs, 0)
     require_at_least("attempts", attempts, 1)
     items = list(items)
-    parcels = [cloudpickle.dumps((function, item)) for item in items]
+    parcels = [Parcel(partial(function, item)) for item in items]
     names = [label(item) for item in items]
     if launcher == "ray":
-        from marl_handover.experiments.executor import through_ray
-
         outcomes = through_ray(dict(enumerate(parcels)), names, address, jobs, attempts, ready)
     else:
         outcomes = _through_loky(parcels, names, jobs or cpu_count(), attempts, ready)
@@ -325,7 +321,7 @@ def _delivered(
 
 
 def _through_loky(
-    parcels: list[bytes], names: list[str], workers: int, attempts: int, ready: Callable[[], None]
+    parcels: list[Parcel], names: list[str], workers: int, attempts: int, ready: Callable[[], None]
 ) -> Generator[Outcome, None, None]:
     """Rounds of joblib's loky workers. When one of them dies, all do, and what is unfinished goes into the next round.
 
@@ -349,7 +345,7 @@ def _through_loky(
                 LOG.warning("%s: a worker died; starting it again (%d of %d)", names[index], deaths[index] + 1, attempts)
 
 
-def _round(backend: LokyWorkers, parcels: Mapping[int, bytes], workers: int, alone: bool) -> Generator[Outcome, None, None]:
+def _round(backend: LokyWorkers, parcels: Mapping[int, Parcel], workers: int, alone: bool) -> Generator[Outcome, None, None]:
     """Outcomes until all are there or a worker dies."""
     delivered = set()
     try:

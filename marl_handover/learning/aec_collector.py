@@ -40,6 +40,7 @@ from marl_handover.learning.collector import Collected, Collector, Explore
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.variant import make_variant
 from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
+from marl_handover.plugins import Parcel
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Outcome, Rules
 
@@ -294,8 +295,8 @@ class AecCollector(Collector):
             self._policy = AecPolicy(self.env.rules, self.model, config, cells, explore, seeds[0][0])
             own = make_env(config, seeds[0][1:], self.model)
             return LocalCollector(own, self._policy, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=False)
-        makers = [partial(make_env, config, own[1:]) for own in seeds]
-        actors = [partial(WorkerPolicy, config, cells, own[0]) for own in seeds]
+        makers = [Parcel(partial(make_env, config, own[1:])) for own in seeds]
+        actors = [Parcel(partial(WorkerPolicy, config, cells, own[0])) for own in seeds]
         if config.collector == "ray":
             self._cluster.enter_context(_cluster(workers))
             return _ray_actors([*makers], [*actors], frames)
@@ -306,7 +307,11 @@ class AecCollector(Collector):
             born.update(set(multiprocessing.active_children()) - others)  # it forgets those that have ended
             return born
 
-        return watched(partial(_processes, [*makers], [*actors], frames), started)
+        try:
+            return watched(partial(_processes, [*makers], [*actors], frames), started)
+        except BaseException:
+            _kill(started())  # or this process waits for them at its end
+            raise
 
     def _finished(self, turns: TensorDict) -> tuple[TensorDict | None, torch.Tensor]:
         """Rows of the episodes that ended, and their number, that of the solved ones, and the transfers they took."""
@@ -388,8 +393,12 @@ def _shut_down(collector: BaseCollector) -> None:
     closing = threading.Thread(target=collector.shutdown, daemon=True)
     closing.start()
     closing.join(SHUTDOWN_S)
-    for worker in getattr(collector, "procs", ()):
-        if not worker._closed and worker.is_alive():
+    _kill(getattr(collector, "procs", ()))
+
+
+def _kill(workers: Iterable[BaseProcess]) -> None:
+    for worker in workers:
+        if not worker._closed and worker.is_alive():  # type: ignore[attr-defined]
             worker.kill()
             worker.join(GRACE_S)
 
@@ -403,15 +412,20 @@ def _cluster(workers: int) -> AbstractContextManager[Any]:
 
 def _processes(makers: list[Callable[[], Any]], actors: list[Callable[[], Any]], frames: int) -> BaseCollector:
     """One process a worker on this machine."""
-    return MultiSyncCollector(
-        makers,
-        policy_factory=actors,
-        frames_per_batch=frames,
-        total_frames=-1,
-        cat_results="stack",
-        num_threads=torch.get_num_threads(),  # or it changes that of this process
-        weight_sync_schemes={"policy": MultiProcessWeightSyncScheme()},
-    )
+    weights = MultiProcessWeightSyncScheme()
+    try:
+        return MultiSyncCollector(
+            makers,
+            policy_factory=actors,
+            frames_per_batch=frames,
+            total_frames=-1,
+            cat_results="stack",
+            num_threads=torch.get_num_threads(),  # or it changes that of this process
+            weight_sync_schemes={"policy": weights},
+        )
+    except BaseException:
+        weights.shutdown()  # by itself it would do so as the interpreter ends, and wait for ever
+        raise
 
 
 def _ray_actors(makers: list[Callable[[], Any]], actors: list[Callable[[], Any]], frames: int) -> BaseCollector:
