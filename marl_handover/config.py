@@ -77,6 +77,7 @@ BACKENDS: Registry[Any] = Registry(
 """Classes with the methods of :class:`~marl_handover.envs.backends.Backend`, called with a model, motion settings and own options."""
 SHAPES = ("file", "links", "none")
 APPROACHES = ("", "+x", "-x", "+y", "-y", "+z", "-z")
+CHARTS = ("paper", "angle")
 MOTION_METHODS = ("optimised", "paper")
 EXPLORATIONS = ("chart", "area")
 LEARNERS = ("independent", "shared", "ctde")
@@ -169,6 +170,7 @@ class CellConfig:
     shapes: str | None = chosen(None, SHAPES)
     grid_mm: float = bounded(5.0, 1.0, 200.0)
     fit_rounding_mm: float = bounded(1.0, 0.0, 100.0)  # fitted radii are rounded inwards to a multiple of this; 0 keeps them
+    chart: str | None = chosen(None, CHARTS)  # of what two arms share; null: the paper's for equal rings, else by hand-over angles
     chart_inset: float = bounded(1.0, 0.1, 1.0)  # part of the chart that is used: 1 = all, 0.95 leaves room for placement noise
     block: BlockConfig = field(default_factory=BlockConfig)
 

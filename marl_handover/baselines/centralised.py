@@ -56,7 +56,7 @@ class MotionActor(HybridActor):
             last.weight.mul_(0.01)
             last.bias.zero_()
         self.places = [ARM_FIELDS.index(name) for name in ("x", "y", "goal_x", "goal_y")]
-        self.register_buffer("scale", torch.tensor([1.0, cell.arms[0].mirror] * 2) * cell.r_max_mm, persistent=False)
+        self.register_buffer("scale", torch.tensor([*cell.views[0]] * 2) * cell.r_max_mm, persistent=False)
 
     def positions(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """World positions (n, 2) in mm of object and goal, as observations (n, size) show them."""
@@ -76,7 +76,7 @@ class MotionActor(HybridActor):
         """Actions (n, 4 + M) of decisions (n, 4); ``noise`` (n, M) in deviations."""
         arm, final = (decision[:, 1] > 0).long(), decision[:, :1] > 0
         start, goal = self.positions(observation)
-        place = self.cell.chart.to_table(decision[:, 2], decision[:, 3])
+        place = self.cell.shared.to_table(decision[:, 2], decision[:, 3])
         way, sign = self.way(arm, start, torch.where(final, goal, place))
         mean, log_std = self.motion(way)
         return torch.cat([decision, mirrored_numbers((mean + log_std.exp() * noise).tanh(), sign)], -1)
@@ -159,7 +159,7 @@ class CentralisedSacLoss(HybridSacLoss):
     def _ways(self, observation: Tensor, place: Tensor) -> Tensor:
         """Features (n, arms, 1 + components, fields) of the ways of all branches, final ones first."""
         start, goal = self.actor.positions(observation)
-        table = self.rules.cell.chart.to_table(place[..., 0], place[..., 1])
+        table = self.rules.cell.shared.to_table(place[..., 0], place[..., 1])
         to = torch.cat([goal[:, None, None].expand(*place.shape[:2], 1, 2), table], 2)
         arm = torch.arange(to.shape[1], device=to.device)[:, None].expand(to.shape[:-1])
         return self.actor.way(arm, start[:, None, None].expand_as(to), to)[0]
@@ -170,7 +170,7 @@ class CentralisedSacLoss(HybridSacLoss):
             future = self.drawn(self.target, following, noise).value
             alive = torch.where(following["terminated"], 0.0, 1.0)
             target = self.config.reward_scale * following["reward"] + self.config.gamma * alive * future
-            place = self.rules.cell.chart.to_table(batch["action"][:, 2], batch["action"][:, 3])
+            place = self.rules.cell.shared.to_table(batch["action"][:, 2], batch["action"][:, 3])
             to = torch.where(batch["final"][:, None], batch["goal"][:, :2], place)
             reach = self.rules.cell.reaches(batch["pose"]) & self.rules.cell.reaches(to)
             possible = reach.gather(1, batch["arm"][:, None])[:, 0]

@@ -280,8 +280,8 @@ class DecentralisedSac(HybridSac):
 
     def _learner(self, rules: TurnRules) -> TurnSacLoss:
         own, seen = self.config, 2 if self.learners == "ctde" else 1
-        actor = TurnActor(own.actor_hidden, own.mixture_components, own.canonical, own.harmonics)
-        critic, target = (TurnCritic(own.critic_hidden, own.final_hidden, own.canonical, own.harmonics, seen) for _ in range(2))
+        actor = TurnActor(own.actor_hidden, own.mixture_components, self.folds, own.harmonics)
+        critic, target = (TurnCritic(own.critic_hidden, own.final_hidden, self.folds, own.harmonics, seen) for _ in range(2))
         target.load_state_dict(critic.state_dict())
         return TurnSacLoss(rules, actor, critic, target.requires_grad_(False), own)
 

@@ -83,7 +83,7 @@ class Dqn(Algorithm):
 
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
         super().__init__(rules, config, generator)
-        chart = rules.cell.chart
+        chart = rules.cell.paper_chart("algorithm=dqn")
         self.points_mm = grid_points(chart, self.config.grid_mm)
         self.two_policies = rules.external_finish
         actions = grid_actions(chart, self.points_mm, not self.two_policies)
@@ -163,7 +163,7 @@ class Dqn(Algorithm):
 
     def index(self, action: Tensor, arm: Tensor, final: Tensor) -> Tensor:
         """Numbers (n,) of the choices that stored actions (n, 4) were: by the nearest place, whatever rounding did to it."""
-        place = self.rules.cell.chart.to_table(action[:, 2], action[:, 3])
+        place = self.rules.cell.shared.to_table(action[:, 2], action[:, 3])
         nearest = torch.cdist(place, self.points).argmin(-1)
         count = len(self.points)
         return torch.where(final, self.rules.cell.num_arms * count + arm, arm * count + nearest)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.arrays import Array, Floats, namespace, wrap
-from marl_handover.cell.chart import Chart
+from marl_handover.cell.chart import PaperChart
 from marl_handover.cell.symmetry import LEFT, RIGHT
 from marl_handover.errors import InvalidSetting
 from marl_handover.task.observations import ARM_FIELDS, RAW_FIELDS
@@ -21,7 +21,7 @@ RESOLUTION_RAD = 1e-5
 """Turns that differ by less are the same to :func:`grid_transfers`."""
 
 
-def grid_points(chart: Chart, grid_mm: float) -> Floats:
+def grid_points(chart: PaperChart, grid_mm: float) -> Floats:
     """Places (p, 2) in mm of a square grid of that spacing around the middle of the table, as far as they lie in the chart.
 
     Raises:
@@ -37,7 +37,7 @@ def grid_points(chart: Chart, grid_mm: float) -> Floats:
     return points[inside]
 
 
-def grid_actions(chart: Chart, points_mm: Floats, can_finish: bool) -> Floats:
+def grid_actions(chart: PaperChart, points_mm: Floats, can_finish: bool) -> Floats:
     """Actions (n, 4) of the choices: arm by place, L first; then, if the policy says when to finish, one for each arm.
 
     Places outside the chart, if it became smaller since, are brought back to its edge.

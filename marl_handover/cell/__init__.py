@@ -3,17 +3,19 @@
 from marl_handover.cell.arm import Arm
 from marl_handover.cell.build import CellModel, build_cell, cell_config, load_cell
 from marl_handover.cell.cell import Cell
-from marl_handover.cell.chart import Chart
+from marl_handover.cell.chart import AngleChart, Chart, PaperChart
 from marl_handover.cell.symmetry import LEFT, NO_ARM, RIGHT, Symmetry
 
 __all__ = [
     "LEFT",
     "NO_ARM",
     "RIGHT",
+    "AngleChart",
     "Arm",
     "Cell",
     "CellModel",
     "Chart",
+    "PaperChart",
     "Symmetry",
     "build_cell",
     "cell_config",

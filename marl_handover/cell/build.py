@@ -59,7 +59,7 @@ def build_cell(config: CellConfig) -> CellModel:
         InvalidSetting, MissingFile, UrdfError, NoSharedSpace, UnconnectedArms: where a setting, the URDF or the geometry cannot be.
     """
     config.validate()
-    names, bases, robots, mirrors = _standing(config)
+    names, bases, robots = _standing(config)
     settings = {robot: robot_of(config, robot) for robot in dict.fromkeys(robots)}
     models = {robot: read_robot(each) for robot, each in settings.items()}
     arms = tuple(models[robot] for robot in robots)
@@ -72,18 +72,22 @@ def build_cell(config: CellConfig) -> CellModel:
             require_grasps(models[robot], settings[robot].pick_height_mm, config.block)
         fits[robot] = fit_annulus(grid, config.fit_rounding_mm, arms=alike)
     listed = []
-    for name, base, robot, mirror in zip(names, bases, robots, mirrors, strict=True):
+    for name, base, robot in zip(names, bases, robots, strict=True):
         fit, height_mm = fits[robot], settings[robot].pick_height_mm
         yaw = fit.yaw_lower_rad, fit.yaw_upper_rad
-        listed.append(Arm(name, base, fit.r_min_mm, fit.r_max_mm, yaw, robot, mirror, height_mm))
+        listed.append(Arm(name, base, fit.r_min_mm, fit.r_max_mm, yaw, robot, _lateral_mm(models[robot]), height_mm))
     each = tuple(fits[robot] for robot in robots), tuple(settings[robot] for robot in robots)
     return CellModel(Cell(tuple(listed), config), arms, grid, *each)
 
 
-def _standing(config: CellConfig) -> tuple[tuple[str, ...], tuple[SE2, ...], tuple[str, ...], tuple[int, ...]]:
-    """Name, base, robot and mirror of each arm."""
+def _lateral_mm(model: ClosedFormArm) -> float:
+    return float(getattr(model, "lateral_mm", 0.0))
+
+
+def _standing(config: CellConfig) -> tuple[tuple[str, ...], tuple[SE2, ...], tuple[str, ...]]:
+    """Name, base and robot of each arm."""
     if not config.arms:
-        return ("left", "right"), mirrored_pair(config.base_distance_mm), (config.robot, config.robot), (-1, 1)
+        return ("left", "right"), mirrored_pair(config.base_distance_mm), (config.robot, config.robot)
     names = tuple(arm.name for arm in config.arms)
     for index, name in enumerate(names):
         if not name or name in names[:index]:
@@ -91,7 +95,7 @@ def _standing(config: CellConfig) -> tuple[tuple[str, ...], tuple[SE2, ...], tup
     if len(names) < 2:
         raise InvalidSetting("cell.arms", len(names), "two arms at least; without any: a mirrored pair")
     bases = tuple(SE2.facing_deg(arm.x_mm, arm.y_mm, arm.facing_deg) for arm in config.arms)
-    return names, bases, tuple(arm.robot or config.robot for arm in config.arms), (1,) * len(names)
+    return names, bases, tuple(arm.robot or config.robot for arm in config.arms)
 
 
 def robot_of(config: CellConfig, robot: str) -> RobotConfig:

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from marl_handover.arrays import Array, namespace, one_where
-from marl_handover.cell.arm import REACH_TOLERANCE_MM, Arm
-from marl_handover.cell.chart import Chart
+from marl_handover.arrays import Array, namespace, one_where, wrap
+from marl_handover.cell.arm import REACH_TOLERANCE_MM, Arm, lateral_rad
+from marl_handover.cell.chart import Chart, PaperChart
 from marl_handover.cell.shared_space import HandoverGraph, SharedSpace
-from marl_handover.cell.symmetry import ARM_LETTERS, Symmetry, symmetries
+from marl_handover.cell.symmetry import ARM_LETTERS, Symmetry, View, pair_views, symmetries
 from marl_handover.config import CellConfig
 from marl_handover.errors import InvalidSetting, TwoArmsOnly, UnconnectedArms, UnequalArms
 from marl_handover.geometry.se2 import SE2
@@ -65,6 +65,11 @@ class Cell:
         """The arms' base frames."""
         return tuple(arm.base for arm in self.arms)
 
+    @cached_property
+    def base_distance_mm(self) -> float:
+        """How far apart the bases of a pair stand."""
+        return self.shared.base_distance_mm
+
     @property
     def r_min_mm(self) -> float:
         """The inner radius, where all arms have the same; else raises :class:`UnequalArms`, as the next two do."""
@@ -104,7 +109,7 @@ class Cell:
     def graph(self) -> HandoverGraph:
         """Who can pass to whom."""
         pairs = [(i, j) for i in range(self.num_arms) for j in range(i + 1, self.num_arms)]
-        spaces = {(i, j): SharedSpace(self.arms[i], self.arms[j], self.config.chart_inset) for i, j in pairs}
+        spaces = {(i, j): SharedSpace(self.arms[i], self.arms[j], self.config.chart_inset, self.config.chart) for i, j in pairs}
         return HandoverGraph(self.names, {pair: space for pair, space in spaces.items() if self.num_arms == 2 or not space.is_empty})
 
     @cached_property
@@ -115,8 +120,35 @@ class Cell:
     @cached_property
     def chart(self) -> Chart:
         """The chart of what the two arms of a pair share; in any other cell, where each pair has its own, raises :class:`TwoArmsOnly`."""
+        return self.shared.chart
+
+    @cached_property
+    def shared(self) -> SharedSpace:
+        """What the two arms of a pair share; in any other cell raises :class:`TwoArmsOnly`."""
         self.require_pair("the one chart of a cell")
-        return self.graph.edges[(0, 1)].chart
+        return self.graph.edges[(0, 1)]
+
+    def paper_chart(self, what: str) -> PaperChart:
+        """The chart of a pair, which ``what`` needs to be the paper's. Raises :class:`InvalidSetting` if it is another one."""
+        if not isinstance(self.chart, PaperChart):
+            limit = f"'paper', which takes two arms with the same ring, for {what}"
+            raise InvalidSetting("cell.chart", "angle", limit)
+        return self.chart
+
+    @cached_property
+    def views(self) -> tuple[View, View]:
+        """How each of two arms sees the shared space's frame; in any other cell raises :class:`TwoArmsOnly`."""
+        self.require_pair("an arm's own view")
+        return pair_views(self.symmetries)
+
+    @cached_property
+    def is_foldable(self) -> bool:
+        """Whether to turn a block the other way round is the mirrored problem for either arm of a pair, positions apart.
+
+        So it is if the hand-over angles fill a single interval, of which each arm is shown the middle as pi; else if the cell is its own
+        mirror image along the base line.
+        """
+        return self.chart.skew_rad is not None or any(element.reflects and not element.swaps for element in self.symmetries)
 
     def place_mm(self, arm: Array, receiver: Array, alpha: Array, beta: Array) -> Array:
         """World position (..., 2) in mm of chart coordinates in what ``arm`` and ``receiver`` (...) share; NaN where they share nothing."""
@@ -155,7 +187,11 @@ class Cell:
         dx, dy = position_mm[..., 0:1] - base_x, position_mm[..., 1:2] - base_y
         forward = facing_x * dx + facing_y * dy
         left = facing_x * dy - facing_y * dx
-        return forward * forward + left * left, xp.atan2(left, forward)
+        square, yaw = forward * forward + left * left, xp.atan2(left, forward)
+        if self._has_lateral:
+            lateral = self._constants(position_mm)[9]
+            yaw = wrap(yaw - xp.atan2(lateral, xp.sqrt(xp.clip(square - lateral * lateral, 1e-12, None))))
+        return square, yaw
 
     def gripper_yaw(self, yaw_rad: Array) -> Array:
         """World yaw psi of each gripper, (..., num_arms), from base yaws; not wrapped."""
@@ -163,7 +199,7 @@ class Cell:
 
     def within(self, square_mm2: Array, yaw_rad: Array) -> Array:
         """Whether each arm's squared radius and base yaw, both (..., num_arms), lie in its annulus sector, to 1 um."""
-        low, high, yaw_low, yaw_high = self._constants(square_mm2)[5:]
+        low, high, yaw_low, yaw_high = self._constants(square_mm2)[5:9]
         return (square_mm2 >= low) & (square_mm2 <= high) & (yaw_rad >= yaw_low) & (yaw_rad <= yaw_high)
 
     def reaches(self, position_mm: Array) -> Array:
@@ -180,8 +216,10 @@ class Cell:
         square, yaw = self.polar(pose)
         if self.within(square, yaw).any():
             return pose
-        radius = np.clip(np.sqrt(square), self.r_min_mm, self.r_max_mm)
-        angle = self.gripper_yaw(np.clip(yaw, *self.yaw_rad))
+        sectors = [(arm.r_min_mm, arm.r_max_mm, *arm.yaw_rad, arm.lateral_mm) for arm in self.arms]
+        r_min, r_max, low, high, lateral = np.array(sectors).T
+        radius = np.clip(np.sqrt(square), r_min, r_max)
+        angle = self.gripper_yaw(np.clip(yaw, low, high) + lateral_rad(lateral, radius))
         bases = np.array([base.position_mm for base in self.bases])
         places = bases + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
         away = np.hypot(*(places - pose[:2]).T)
@@ -195,9 +233,9 @@ class Cell:
         return values[0]
 
     def _constants(self, like: Array) -> Array:
-        """Facts of the arms as arrays (9, num_arms) of the kind of ``like``, made once for each kind.
+        """Facts of the arms as arrays (10, num_arms) of the kind of ``like``, made once for each kind.
 
-        The base's x, y, facing vector and facing angle; least and greatest squared radius and yaw, tolerances included.
+        The base's x, y, facing vector and facing angle; least and greatest squared radius and yaw, tolerances included; the lateral offset.
         """
         key = (like.dtype, getattr(like, "device", None))
         if key not in self._kinds:
@@ -206,13 +244,17 @@ class Cell:
                 low, high = arm.r_min_mm - REACH_TOLERANCE_MM, arm.r_max_mm + REACH_TOLERANCE_MM
                 slack = REACH_TOLERANCE_MM / arm.r_min_mm
                 sector = [low * low, high * high, arm.yaw_rad[0] - slack, arm.yaw_rad[1] + slack]
-                rows.append([arm.base.x_mm, arm.base.y_mm, *arm.base.facing, arm.base.facing_rad, *sector])
+                rows.append([arm.base.x_mm, arm.base.y_mm, *arm.base.facing, arm.base.facing_rad, *sector, arm.lateral_mm])
             table = np.array(rows, np.float64).T
             if isinstance(like, (np.ndarray, np.generic)):
                 self._kinds[key] = table.astype(like.dtype)
             else:
                 self._kinds[key] = like.new_tensor(table.tolist())
         return self._kinds[key]
+
+    @cached_property
+    def _has_lateral(self) -> bool:
+        return any(arm.lateral_mm for arm in self.arms)
 
     @cached_property
     def _kinds(self) -> dict[Any, Array]:

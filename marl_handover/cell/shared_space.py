@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from marl_handover.arrays import Array, namespace
 from marl_handover.cell.arm import Arm
-from marl_handover.cell.chart import Chart
+from marl_handover.cell.chart import AngleChart, Chart, PaperChart
 from marl_handover.errors import NoSharedSpace
 from marl_handover.geometry.se2 import SE2
 
@@ -63,11 +63,13 @@ class SharedSpace:
         first: an arm of the cell.
         second: another one.
         inset: part of the chart that is in use.
+        charted: ``paper``, ``angle``, or None: the paper's where both arms have the same ring, else by hand-over angles.
     """
 
     first: Arm
     second: Arm
     inset: float = 1.0
+    charted: str | None = None
 
     @property
     def base_distance_mm(self) -> float:
@@ -97,16 +99,26 @@ class SharedSpace:
 
     @cached_property
     def chart(self) -> Chart:
-        """The paper's chart of the space, in :attr:`frame`.
+        """The chart of the space, in :attr:`frame`.
 
         Raises:
-            NoSharedSpace: the space is not the whole lens that two equal annuli have in common.
+            NoSharedSpace: both reach nothing, or the space is not what the chart is for: the paper's takes the whole lens that two equal
+                annuli have in common.
         """
+        one, other = self.first, self.second
+        alike = max(abs(one.r_min_mm - other.r_min_mm), abs(one.r_max_mm - other.r_max_mm)) < _ALIKE_MM
+        alike &= one.lateral_mm == other.lateral_mm == 0
+        if self.charted == "angle" or (self.charted is None and not alike):
+            return AngleChart(one, other, self.inset)
+        if not alike:
+            reach = f"arms {one.name!r} and {other.name!r} reach {one.r_min_mm:g} to {one.r_max_mm:g} and {other.r_min_mm:g} to "
+            reason = f"{reach}{other.r_max_mm:g} mm; cell.chart=paper needs equal rings and no lateral offset, cell.chart=angle does not"
+            raise NoSharedSpace(self.base_distance_mm, one.r_min_mm, one.r_max_mm, reason)
+        return self._lens()
+
+    def _lens(self) -> PaperChart:
         one, other, distance = self.first, self.second, self.base_distance_mm
-        if max(abs(one.r_min_mm - other.r_min_mm), abs(one.r_max_mm - other.r_max_mm)) > _ALIKE_MM:
-            reason = f"arms {one.name!r} and {other.name!r} reach {one.r_min_mm:g} to {one.r_max_mm:g} and {other.r_min_mm:g} to "
-            raise NoSharedSpace(distance, one.r_min_mm, one.r_max_mm, f"{reason}{other.r_max_mm:g} mm; its chart needs equal radii")
-        chart = Chart(one.r_min_mm, one.r_max_mm, distance, self.inset)
+        chart = PaperChart(one.r_min_mm, one.r_max_mm, distance, self.inset)
         tip = math.atan2(chart.x_max_mm, distance / 2)
         for arm, partner in ((one, other), (other, one)):
             ahead = arm.base.to_local(partner.base.position_mm)

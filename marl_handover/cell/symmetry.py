@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,29 @@ ARM_LETTERS = ("L", "R")
 _SAME_MM, _SAME_RAD = 1e-6, 1e-6
 
 Matrix = tuple[tuple[float, float], tuple[float, float]]
+
+
+class View(NamedTuple):
+    """How an arm of a pair sees the frame of the shared space, so that each has its own base at the bottom: signs of x and of y."""
+
+    x_sign: int
+    y_sign: int
+
+    @property
+    def turn_sign(self) -> int:
+        """Of angles: -1 in a mirror image."""
+        return self.x_sign * self.y_sign
+
+
+def pair_views(group: Sequence[Symmetry]) -> tuple[View, View]:
+    """The views of the first and the second arm of a pair with these symmetries.
+
+    The second sees the frame as it is, the first its image under the symmetry that swaps the arms: mirrored, unless only half a turn takes
+    them onto each other, as where grips are beside their planes; mirrored also where none does, for the base line to be the same line.
+    """
+    swaps = [element for element in group if element.swaps]
+    turned = bool(swaps) and not any(element.reflects for element in swaps)
+    return View(-1 if turned else 1, -1), View(1, 1)
 
 
 @dataclass(frozen=True)
@@ -128,12 +152,14 @@ def _symmetry(R: np.ndarray, shift: np.ndarray, arms: tuple[int, ...], spaces: M
 def _image(arm: Arm, arms: Sequence[Arm], R: np.ndarray, shift: np.ndarray, handed: float) -> int | None:
     """The arm that stands where ``arm`` comes to stand, and can do what it can."""
     low, high = sorted(handed * value for value in arm.yaw_rad)
+    lateral = handed * arm.lateral_mm
     for index, other in enumerate(arms):
         there = np.linalg.norm(R @ arm.base.position_mm + shift - other.base.position_mm) < _SAME_MM
         faces = np.linalg.norm(R @ arm.base.rotation()[:, 0] - other.base.rotation()[:, 0]) < _SAME_RAD
         reach = max(abs(arm.r_min_mm - other.r_min_mm), abs(arm.r_max_mm - other.r_max_mm)) < _SAME_MM
         turns = max(abs(low - other.yaw_rad[0]), abs(high - other.yaw_rad[1])) < _SAME_RAD
-        if there and faces and reach and turns and arm.robot == other.robot:
+        beside = abs(lateral - other.lateral_mm) < _SAME_MM
+        if there and faces and reach and turns and beside and arm.robot == other.robot:
             return index
     return None
 

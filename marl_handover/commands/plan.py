@@ -224,7 +224,7 @@ def _commanded(rules: Rules, pose: Floats, goal: Floats, result: Transition) -> 
 
 def _transfer(rules: Rules, arm: int, final: bool, before: Floats, after: Floats, path_mm: float, refusal: str | None) -> dict[str, Any]:
     """One entry of ``transfers``. A final transfer goes to the goal, not to a place of the chart, so it has no alpha and beta."""
-    alpha, beta = rules.cell.chart.from_table(after[:2])
+    alpha, beta = rules.cell.shared.from_table(after[:2])
     inside = refusal is None and not final
     return {
         "arm": ARM_LETTERS[arm],

@@ -164,7 +164,7 @@ def calibrate_camera(
 
 def places(cell: Cell) -> tuple[tuple[float, float, float], ...]:
     """Between these, x_mm, y_mm, theta_rad, the block is carried; both arms of ``cell`` reach them."""
-    return tuple((float(x), float(y), 0.0) for x, y in cell.chart.to_table(np.array([-_ALPHA, _ALPHA]), np.zeros(2)))
+    return tuple((float(x), float(y), 0.0) for x, y in cell.shared.to_table(np.array([-_ALPHA, _ALPHA]), np.zeros(2)))
 
 
 class Grip(NamedTuple):

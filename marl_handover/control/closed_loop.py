@@ -286,7 +286,7 @@ def transfer_command(rules: Rules, pose: Floats, goal: Floats, action: Floats) -
     """What a supervisor's ``action`` (4,) tells an arm to do with an object at ``pose`` (3,), goal (3,)."""
     command = rules.decode(action)
     predicted, feasible = rules.transfer(pose, goal, command)
-    chart = np.array(rules.cell.chart.from_table(command.place_mm), float)
+    chart = np.array(rules.cell.shared.from_table(command.place_mm), float)
     target = goal[:2] if command.final else command.place_mm
     return TransferCommand(int(command.arm), bool(command.final), chart, target, predicted, bool(feasible))
 

@@ -72,12 +72,14 @@ class TurnRules(Rules):
         one = xp.ones_like(action[..., 0])
         final = xp.where(action[..., 0] > CHOICE_EDGE, one, -one)
         right = xp.where(turn == 1, one, -one)
-        return xp.stack([final, right, action[..., 1], action[..., 2] * self.mirror(turn, one)], -1)
+        across, along = self.view_signs(turn, one)
+        return xp.stack([final, right, action[..., 1] * across, action[..., 2] * along], -1)
 
-    def mirror(self, turn: Array, like: Array) -> Array:
-        """-1 where arm ``turn`` (...) is the mirrored one, else 1, in the kind of ``like``."""
-        left, right = (arm.mirror * namespace(like).ones_like(like) for arm in self.cell.arms)
-        return namespace(like).where(turn == 1, right, left)
+    def view_signs(self, turn: Array, like: Array) -> tuple[Array, Array]:
+        """Signs of alpha and beta in the view of arm ``turn`` (...), each in the kind of ``like`` (...)."""
+        xp, (left, right) = namespace(like), self.cell.views
+        across, along = (xp.where(turn == 1, right[axis] * xp.ones_like(like), left[axis] * xp.ones_like(like)) for axis in range(2))
+        return across, along
 
     def command(self, action: Array, turn: Array) -> Command:
         """The command of a decision; for a pass, one that must not be carried out."""

@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from marl_handover.cell.chart import Chart
+from marl_handover.cell.chart import PaperChart
 from marl_handover.errors import InvalidSetting
 from marl_handover.learning.settings import ALGORITHMS, AlgorithmConfig, OffPolicyConfig, TrainConfig
 from marl_handover.progress import working
@@ -37,7 +37,7 @@ class Places:
         device: of the coordinates.
     """
 
-    def __init__(self, chart: Chart, device: torch.device | str = "cpu") -> None:
+    def __init__(self, chart: PaperChart, device: torch.device | str = "cpu") -> None:
         knots = torch.linspace(-1.0, 1.0, KNOTS, dtype=torch.float64)
         width = chart.y_max_mm(knots * (chart.inset * chart.x_max_mm))
         share = torch.cat([width.new_zeros(1), torch.cumulative_trapezoid(width, knots)])
@@ -72,7 +72,7 @@ class UniformActions:
         if isinstance(own, OffPolicyConfig) and own.exploration == "area":
             if self.size != Rules.action_size:
                 raise InvalidSetting("algorithm.exploration", own.exploration, f"'chart' for variant={config.variant}")
-            self.places = Places(rules.cell.chart, config.device)
+            self.places = Places(rules.cell.paper_chart("algorithm.exploration=area"), config.device)
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Actions (count, size)."""

@@ -205,7 +205,7 @@ class Trace:
 
     def __call__(self, decision: Decision) -> None:
         """Take in one decision of the running episodes."""
-        alpha, beta = self.rules.cell.chart.from_table(decision.result.command.place_mm)
+        alpha, beta = self.rules.cell.shared.from_table(decision.result.command.place_mm)
         for row, episode in enumerate(decision.episode):
             lines = self.episodes.setdefault(int(episode), [])
             commanded, external = self._commanded(decision, row, float(alpha[row]), float(beta[row])), self._external(decision, row)

@@ -61,7 +61,7 @@ class HybridSacLoss(LossModule):
         shape = place.shape[:-1]
         arm = torch.arange(arms, device=place.device)[:, None].expand(shape)
         command = Command(
-            torch.zeros(shape, dtype=torch.bool, device=place.device), arm, self.rules.cell.chart.to_table(place[..., 0], place[..., 1])
+            torch.zeros(shape, dtype=torch.bool, device=place.device), arm, self.rules.cell.shared.to_table(place[..., 0], place[..., 1])
         )
         pose, goal = (batch[key][:, None, None].expand(*shape, 3) for key in ("pose", "goal"))
         before, epsilon = (batch[key][:, None, None].expand(shape) for key in ("previous_arm", "epsilon"))
@@ -192,9 +192,9 @@ class HybridSac(Algorithm):
         super().__init__(rules, config, generator)
         own = self.config
         can_finish = not rules.external_finish
-        actor = HybridActor(rules.cell, own.actor_hidden, own.mixture_components, can_finish, own.canonical, own.harmonics).to(self.device)
-        critic = AfterstateCritic(own.critic_hidden, own.final_hidden, own.canonical, own.harmonics).to(self.device)
-        target = AfterstateCritic(own.critic_hidden, own.final_hidden, own.canonical, own.harmonics).to(self.device).requires_grad_(False)
+        actor = HybridActor(rules.cell, own.actor_hidden, own.mixture_components, can_finish, self.folds, own.harmonics).to(self.device)
+        critic = AfterstateCritic(own.critic_hidden, own.final_hidden, self.folds, own.harmonics).to(self.device)
+        target = AfterstateCritic(own.critic_hidden, own.final_hidden, self.folds, own.harmonics).to(self.device).requires_grad_(False)
         target.load_state_dict(critic.state_dict())
         self.loss = HybridSacLoss(rules, actor, critic, target, own).to(self.device)
         adam: dict[str, Any] = {"lr": own.learning_rate, "fused": True}
@@ -205,6 +205,11 @@ class HybridSac(Algorithm):
         self._critic_loss = compiled(self.loss.critic_loss, config.compile)
         self._actor_loss = compiled(self.loss.actor_loss, config.compile)
         self.targets = self._targets(0.0)
+
+    @property
+    def folds(self) -> bool:
+        """Whether the networks fold the symmetry M_x: as the settings say, where the cell has it."""
+        return self.config.canonical and self.rules.cell.is_foldable
 
     def _targets(self, fraction: float) -> tuple[float, float]:
         """Target entropies of places and branches; they fall until ``entropy_until`` so that the last policies are nearly deterministic."""
@@ -230,7 +235,7 @@ class HybridSac(Algorithm):
 
     def about(self) -> dict[str, Any]:
         """How the actor reads its blocks."""
-        return {"modes": self.config.mixture_components, "canonical": self.config.canonical, "harmonics": self.config.harmonics}
+        return {"modes": self.config.mixture_components, "canonical": self.folds, "harmonics": self.config.harmonics}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`; a checkpoint from before there was an average starts one from the actor it has."""

@@ -143,15 +143,15 @@ class HybridActor(nn.Module):
     """One network for both arms, each seeing the problem in its own mirrored frame.
 
     Args:
-        cell: the cell, for the arms' mirror signs.
+        cell: the cell, for how each arm sees it.
         hidden: widths.
         components: mixture components an arm.
         can_finish: whether there is a final branch (architecture B); without one its logit is minus infinity.
-        canonical: fold the symmetry M_x.
+        canonical: fold the symmetry M_x, where the cell has it.
         harmonics: see :class:`AngleFeatures`.
     """
 
-    beta_sign: Tensor
+    place_sign: Tensor
 
     def __init__(self, cell: Cell, hidden: Sequence[int], components: int, can_finish: bool, canonical: bool, harmonics: int) -> None:
         super().__init__()
@@ -162,7 +162,7 @@ class HybridActor(nn.Module):
         if components > 1 and isinstance(last, nn.Linear):  # start the components apart, so that they do not learn the same thing
             with torch.no_grad():
                 last.bias[1 + components : 1 + 3 * components : 2] = torch.linspace(-0.8, 0.8, components)
-        self.register_buffer("beta_sign", torch.tensor([float(arm.mirror) for arm in cell.arms]), persistent=False)
+        self.register_buffer("place_sign", torch.tensor(cell.views, dtype=torch.float32), persistent=False)
 
     def forward(self, observation: Tensor) -> ActionDistribution:
         """ActionDistribution of observations (n, size) of the ``relative`` layout."""
@@ -174,8 +174,8 @@ class HybridActor(nn.Module):
             logits = torch.cat([torch.full_like(logits[..., :1], -1e9), logits[..., 1:]], -1)
         mean = out[..., 1 + components : 1 + 3 * components].unflatten(-1, (components, 2))
         log_std = out[..., 1 + 3 * components :].unflatten(-1, (components, 2)).clamp(*LOG_STD_RANGE)
-        signs = torch.stack([sign.expand(mean.shape[:-1]), self.beta_sign[:, None].expand(mean.shape[:-1])], -1)
-        return ActionDistribution(logits, mean * signs, log_std)
+        across, along = (self.place_sign[:, axis, None].expand(mean.shape[:-1]) for axis in range(2))
+        return ActionDistribution(logits, mean * torch.stack([sign * across, along], -1), log_std)
 
 
 class AfterstateCritic(nn.Module):

@@ -35,7 +35,7 @@ class NetworkPolicy(SupervisorPolicy):
         self.layers = network_layers(arrays, about)
         self.hybrid = about["kind"] == "hybrid"
         self.odd = np.array([-1.0 if field in ODD_FIELDS else 1.0 for field in ARM_FIELDS], np.float32)
-        self.beta_sign = np.array([arm.mirror for arm in rules.cell.arms], np.float32)
+        self.place_sign = np.array(rules.cell.views, np.float32)
         self.sines = [ARM_FIELDS.index(field) for field in ("sin_hand_over", "sin_finish_error")]
         self.angles = [ARM_FIELDS.index(field) for field in ("cos_finish_error", "cos_hand_over")]
 
@@ -78,7 +78,7 @@ class NetworkPolicy(SupervisorPolicy):
         if self.rules.external_finish:
             logits[..., 0] = -math.inf
         mean = np.tanh(out[..., 1 + components : 1 + 3 * components]).reshape(*out.shape[:-1], components, 2)
-        signs = np.stack(np.broadcast_arrays(sign, self.beta_sign), -1)
+        signs = np.stack(np.broadcast_arrays(sign * self.place_sign[:, 0], self.place_sign[:, 1]), -1)
         place = mean * signs[..., None, :]
         return logits.reshape(*logits.shape[:-2], -1), place.reshape(*place.shape[:-3], -1, 2)
 
@@ -140,7 +140,7 @@ class DiscretePolicy(NetworkPolicy):
         return np.where(goal_reach(self.rules, layout, observation)[..., None, :], value, -math.inf).max(-1)
 
     def _actions(self) -> Floats:
-        return grid_actions(self.rules.cell.chart, self.points_mm, not self.rules.external_finish)
+        return grid_actions(self.rules.cell.paper_chart("a policy on a grid of places"), self.points_mm, not self.rules.external_finish)
 
 
 FINISH, PASS, PLACE = 0, 1, 2
@@ -191,7 +191,7 @@ class TurnsPolicy(NetworkPolicy):
         out = self._asked(self._harmonics(np.where(sign[..., None] < 0, blocks * self.odd, blocks)))
         components = self.about["modes"]
         places = np.tanh(out[..., PLACE + components : PLACE + 3 * components]).reshape(*out.shape[:-1], components, 2)
-        signs = np.stack(np.broadcast_arrays(sign, self.beta_sign), -1)
+        signs = np.stack(np.broadcast_arrays(sign * self.place_sign[:, 0], self.place_sign[:, 1]), -1)
         return out[..., : PLACE + components], places * signs[..., None, :]
 
     @staticmethod

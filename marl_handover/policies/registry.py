@@ -92,7 +92,7 @@ class GreedyPolicy(SupervisorPolicy):
         square, yaw = cell.polar(pose)
         near = np.where(cell.within(square, yaw), square, math.inf).argmin(-1)
         alpha = np.linspace(-1.0, 1.0, self.PLACES)
-        table = cell.chart.to_table(alpha, 0 * alpha)
+        table = cell.shared.to_table(alpha, 0 * alpha)
         turn = cell.polar(table)[1] - yaw[..., None, :]
         placed_theta = pose[..., 2, None] + select(turn, np.broadcast_to(near[..., None], turn.shape[:-1]))
         placed = np.concatenate([np.broadcast_to(table, (*placed_theta.shape, 2)), placed_theta[..., None]], -1)

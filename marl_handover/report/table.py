@@ -70,7 +70,7 @@ def draw_chart(axes: Axes, cell: Cell, inner: Sequence[float] = (-0.5, 0.0, 0.5)
     for value in (-1.0, *inner, 1.0):
         border = abs(value) == 1
         style = {"color": INK, "linewidth": 1.4 if border else 0.6, "zorder": 4}
-        for line in (cell.chart.to_table(along, value + 0 * along), cell.chart.to_table(value + 0 * along, along)):
+        for line in (cell.shared.to_table(along, value + 0 * along), cell.shared.to_table(value + 0 * along, along)):
             axes.plot(line[:, 0], line[:, 1], label=label if border else None, **style)
             label = label if not border else None
 

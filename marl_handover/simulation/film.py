@@ -53,7 +53,7 @@ def _sector_mm(cell: Cell, arm: int) -> tuple[Floats, Floats]:
 def _shared_mm(cell: Cell) -> tuple[Floats, Floats]:
     """Lower and upper edge (n, 2) of the chart."""
     along = np.linspace(-1.0, 1.0, _STRIP)
-    return np.asarray(cell.chart.to_table(along, 0 * along - 1)), np.asarray(cell.chart.to_table(along, 0 * along + 1))
+    return np.asarray(cell.shared.to_table(along, 0 * along - 1)), np.asarray(cell.shared.to_table(along, 0 * along + 1))
 
 
 def _lay(engine: Engine, one_mm: Floats, other_mm: Floats, height_mm: float, rgb: Floats) -> None:

@@ -41,7 +41,9 @@ ARM_FIELDS = (
 """Fields of one arm's block of ``relative``; the vector holds one block an arm, L first.
 
 ``finish_error`` is the orientation error this arm would leave if it placed the object at the goal now. ``hand_over`` is the hand-over angle
-psi_own(p) - psi_other(p) at which passing the object at p would let the other arm finish exactly. All are mirrored into the arm's frame.
+psi_own(p) - psi_other(p) at which passing the object at p would let the other arm finish exactly, counted so that the middle of those that
+the shared space offers is pi. All are in the arm's own view: the frame of the shared space, or its image that has the arm's base at the
+bottom (:attr:`~marl_handover.cell.cell.Cell.views`).
 What an arm that does not reach the goal would leave has no bearing on the problem: its cosine, sine and error are 0, its margin -1.
 """
 
@@ -111,16 +113,24 @@ def _relative(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsil
     """One block an arm. Both arms' quantities are computed at once, with the arms on the last axis."""
     xp, cell = namespace(pose), rules.cell
     cell.require_pair("task.layout=relative")
-    scale = cell.r_max_mm
+    scale = max(arm.r_max_mm for arm in cell.arms)
+    views, space, skew = cell.views, cell.shared, cell.chart.skew_rad
+    at, goal_at = space.in_frame(pose), space.in_frame(goal)
     square, yaw = cell.polar(pose)
     goal_square, goal_yaw = cell.polar(goal)
     reach = cell.within(square, yaw) + 0.0 * yaw
     goal_reach = cell.within(goal_square, goal_yaw) + 0.0 * yaw
-    mirror = xp.stack([arm.mirror + 0 * pose[..., 0] for arm in cell.arms], -1)
+    across, along, mirror = (
+        xp.stack([sign + 0 * pose[..., 0] for sign in signs], -1)
+        for signs in ([view.x_sign for view in views], [view.y_sign for view in views], [view.turn_sign for view in views])
+    )
     turn = (pose[..., 2] - goal[..., 2])[..., None]
     finish = rules.orientation_error(turn + goal_yaw - yaw, 0 * turn)
     other_goal_psi = xp.flip(cell.gripper_yaw(goal_yaw), (-1,))
-    hand_over = (cell.gripper_yaw(yaw) - turn - other_goal_psi) * rules.config.symmetry_order
+    angle = cell.gripper_yaw(yaw) - turn - other_goal_psi
+    if skew:
+        angle = xp.stack([angle[..., 0] - skew, angle[..., 1] + skew], -1)
+    hand_over = angle * rules.config.symmetry_order
     epsilon = epsilon_rad + 0 * pose[..., 0]
     relative_error = mirror * finish / epsilon[..., None]
     in_epsilons = goal_reach * xp.clip(relative_error, -ERROR_CLIP, ERROR_CLIP) / ERROR_CLIP
@@ -129,10 +139,10 @@ def _relative(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsil
     was_previous = xp.stack([(previous_arm == index) + 0 * pose[..., 0] for index in range(cell.num_arms)], -1)
     one = xp.ones_like(yaw)
     fields = [
-        pose[..., 0:1] / scale * one,
-        mirror * pose[..., 1:2] / scale,
-        goal[..., 0:1] / scale * one,
-        mirror * goal[..., 1:2] / scale,
+        across * at[..., 0:1] / scale,
+        along * at[..., 1:2] / scale,
+        across * goal_at[..., 0:1] / scale,
+        along * goal_at[..., 1:2] / scale,
         reach,
         xp.flip(reach, (-1,)),
         goal_reach,

@@ -1,27 +1,37 @@
 """The exact planner: the fewest transfers that solve a problem, by interval arithmetic (method section 5).
 
 Along arms b_1 .. b_n, each sharing a space with the next, with hand-overs p_1 .. p_{n-1} in those spaces, the object's turn is a sum of
-hand-over angles gamma(p) = psi_i(p) - psi_j(p), counted + from i to j, - from j to i, i < j. On a shared space gamma fills
-[gamma_min, 2 pi - gamma_min] and takes every value on the axis y = 0 of its frame, at x = -(d/2) cot(gamma / 2). So the arms b_1 .. b_n
-can do it iff the required sum lies within epsilon, modulo the block's symmetry, in a sum of n - 1 intervals. As all intervals are centred
-at pi, of all ways from b_1 to b_n with n arms the one with the widest sum can do whatever the others can.
+hand-over angles gamma(p) = psi_i(p) - psi_j(p), counted + from i to j, - from j to i, i < j. On a shared space gamma fills one interval or
+more, the arcs of its chart. So the arms b_1 .. b_n can do it iff the required sum lies within epsilon, modulo the block's symmetry, in a
+sum of n - 1 of these. A way from b_1 to b_n whose sum lies within that of another, modulo the symmetry, need not be looked at: of arms that
+stand alike it is always the widest that is left.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from marl_handover.arrays import Array, namespace, one_where
-from marl_handover.errors import InvalidSetting
 from marl_handover.task.rules import Rules
 
 Walk = tuple[int, ...]
 """Arms in the order in which they move the object."""
+
+_SAME_RAD = 1e-9
+
+
+class _Way(NamedTuple):
+    """A walk, the arc of each hand-over, and the lowest and highest sum of the signed hand-over angles in rad."""
+
+    walk: Walk
+    arcs: tuple[int, ...] = ()
+    low_rad: float = 0.0
+    high_rad: float = 0.0
 
 
 class Plan(NamedTuple):
@@ -46,7 +56,7 @@ class ExactPlanner:
     """Batched optimal plans.
 
     Attributes:
-        walks: the sequences of arms that are looked at, the shortest first.
+        walks: the sequences of arms that are looked at, the shortest first; one may come several times, with other arcs.
 
     Raises:
         NoSharedSpace, InvalidSetting: a shared space of the cell has no chart, or hand-over angles for which the plans are not optimal.
@@ -54,48 +64,49 @@ class ExactPlanner:
 
     def __init__(self, rules: Rules) -> None:
         self.rules = rules
-        self._gamma_min_rad: dict[tuple[int, int], float] = {}
-        for pair, space in rules.cell.graph.edges.items():
-            chart = space.chart
-            if chart.base_distance_mm**2 + chart.r_min_mm**2 < chart.r_max_mm**2:
-                # Only then is the smallest hand-over angle at the tips of the shared space, on the axis y = 0.
-                limit = math.sqrt(chart.r_max_mm**2 - chart.r_min_mm**2)
-                raise InvalidSetting("base_distance_mm", chart.base_distance_mm, f"at least {limit:.1f} for the exact planner")
-            self._gamma_min_rad[pair] = 2 * math.atan2(chart.base_distance_mm / 2, chart.inset * chart.x_max_mm)
-        self.walks: list[Walk] = []
+        self._arcs = {pair: space.chart.arcs for pair, space in rules.cell.graph.edges.items()}
+        self._ways: list[_Way] = []
         self._tables: dict[Any, Array] = {}
         self._of_length: list[range] = [range(0)]
-        for walks in self._widest_walks(rules.config.max_steps):
-            self._of_length.append(range(len(self.walks), len(self.walks) + len(walks)))
-            self.walks += walks
+        ways = [_Way((arm,)) for arm in range(rules.cell.num_arms)]
+        for transfers in range(1, rules.config.max_steps + 1):
+            if transfers > 1:
+                ways = self._worth_trying(longer for way in ways for longer in self._longer(way))
+            self._of_length.append(range(len(self._ways), len(self._ways) + len(ways)))
+            self._ways += ways
+        self.walks: list[Walk] = [way.walk for way in self._ways]
 
-    def _widest_walks(self, longest: int) -> list[list[Walk]]:
-        """Of 1 .. ``longest`` arms: from each arm to each, the walk with the widest sum of hand-over angles."""
-        graph = self.rules.cell.graph
-        lengths: list[list[Walk]] = [[(arm,) for arm in range(self.rules.cell.num_arms)]]
-        while len(lengths) < longest:
-            best: dict[tuple[int, int], Walk] = {}
-            for walk in lengths[-1]:
-                for arm in graph.neighbours(walk[-1]):
-                    longer, ends = (*walk, arm), (walk[0], arm)
-                    if ends not in best or self._width_rad(longer) > self._width_rad(best[ends]):
-                        best[ends] = longer
-            lengths.append(list(best.values()))
-        return lengths
-
-    def _width_rad(self, walk: Walk) -> float:
-        low, high = self.interval(walk)
-        return high - low
+    def _longer(self, way: _Way) -> Iterator[_Way]:
+        """The ways with one more arm."""
+        giver = way.walk[-1]
+        for receiver in self.rules.cell.graph.neighbours(giver):
+            for number, arc in enumerate(self._arcs[min(giver, receiver), max(giver, receiver)]):
+                low, high = arc.low_rad, 2 * math.pi - arc.back_low_rad
+                least, most = (low, high) if giver < receiver else (-high, -low)
+                yield _Way((*way.walk, receiver), (*way.arcs, number), way.low_rad + least, way.high_rad + most)
 
     def interval(self, walk: Walk) -> tuple[float, float]:
-        """Lowest and highest sum of the signed hand-over angles along a walk, in rad."""
-        total_low = total_high = 0.0
-        for giver, receiver in pairwise(walk):
-            low = self._gamma_min_rad[min(giver, receiver), max(giver, receiver)]
-            high = 2 * math.pi - low
-            total_low += low if giver < receiver else -high
-            total_high += high if giver < receiver else -low
-        return total_low, total_high
+        """Lowest and highest sum of the signed hand-over angles along a walk, in rad, with the first arc of each shared space."""
+        way = _Way(walk[:1])
+        while len(way.walk) < len(walk):
+            way = next(longer for longer in self._longer(way) if longer.walk[-1] == walk[len(way.walk)])
+        return way.low_rad, way.high_rad
+
+    def _worth_trying(self, ways: Iterable[_Way]) -> list[_Way]:
+        """Those of ``ways`` whose sums do not all lie within those of another one from the same arm to the same."""
+        kept: dict[tuple[int, int], list[_Way]] = {}
+        for way in ways:
+            rivals = kept.setdefault((way.walk[0], way.walk[-1]), [])
+            if not any(self._covers(rival, way) for rival in rivals):
+                rivals[:] = [*(rival for rival in rivals if not self._covers(way, rival)), way]
+        return [way for rivals in kept.values() for way in rivals]
+
+    def _covers(self, wide: _Way, other: _Way) -> bool:
+        """Whether all sums of ``other`` are sums of ``wide``, modulo the block's symmetry."""
+        period = 2 * math.pi / self.rules.config.symmetry_order
+        widths = wide.high_rad - wide.low_rad, other.high_rad - other.low_rad
+        apart = (wide.low_rad + wide.high_rad - other.low_rad - other.high_rad) / 2
+        return abs(math.remainder(apart, period)) + widths[1] / 2 <= widths[0] / 2 + _SAME_RAD or widths[0] >= period
 
     def plan(self, pose: Array, goal: Array, epsilon_rad: float | None = None) -> Plan:
         """Optimal plans from ``pose`` to ``goal``, both (..., 3). Among equally short ones, the one with the most slack."""
@@ -116,9 +127,10 @@ class ExactPlanner:
             if bool(found.all()):
                 break
             for number in self._of_length[transfers]:
-                first, last = self.walks[number][0], self.walks[number][-1]
+                way = self._ways[number]
+                first, last = way.walk[0], way.walk[-1]
                 needed = turn + psi[..., first] - goal_psi[..., last]
-                fraction, error, slack = self._fit(needed, self.walks[number])
+                fraction, error, slack = self._fit(needed, way)
                 allowed = ~found & start_in[..., first] & goal_in[..., last] & (abs(error) <= epsilon) & (slack > best_slack)
                 best = Plan(
                     xp.where(allowed, transfers, best.transfers),
@@ -130,10 +142,10 @@ class ExactPlanner:
                 best_slack = xp.where(allowed, slack, best_slack)
         return best
 
-    def _fit(self, needed_rad: Array, walk: Walk) -> tuple[Array, Array, Array]:
+    def _fit(self, needed_rad: Array, way: _Way) -> tuple[Array, Array, Array]:
         """Fraction of the interval, orientation error left, and slack in rad (negative outside), each (...)."""
         xp = namespace(needed_rad)
-        low, high = self.interval(walk)
+        low, high = way.low_rad, way.high_rad
         period = 2 * math.pi / self.rules.config.symmetry_order
         centre, half = (low + high) / 2, (high - low) / 2
         # The representative nearest to the interval's centre is the one with the most slack.
@@ -143,55 +155,53 @@ class ExactPlanner:
         return fraction, inside - offset, half - abs(offset)
 
     def hand_over_mm(self, plan: Plan, index: int) -> Array:
-        """Position (..., 2) in mm of hand-over number ``index`` (0 is the first), on the axis y = 0 of the frame of what two arms share.
+        """Position (..., 2) in mm of hand-over number ``index`` (0 is the first), in the middle of those with the angle that it is to have.
 
         Where a plan has no such hand-over the place means nothing.
         """
-        giver, receiver = self._movers(plan, index)
+        xp = namespace(plan.fraction)
+        giver, receiver, taken = self._movers(plan, index)
         place = None
         for (i, j), space in self.rules.cell.graph.edges.items():
-            there = self._on_axis_mm(space.chart.base_distance_mm, self._gamma_min_rad[i, j], plan.fraction, giver == i)
-            there = space.in_world(there)
             asked = ((giver == i) & (receiver == j)) | ((giver == j) & (receiver == i))
-            place = there if place is None else one_where(asked, there, place)
+            for number, arc in enumerate(self._arcs[i, j]):
+                lowest = arc.low_rad
+                if arc.back_low_rad != lowest:
+                    lowest = xp.where(giver == i, arc.low_rad + 0 * plan.fraction, arc.back_low_rad + 0 * plan.fraction)
+                upward = lowest + plan.fraction * arc.width_rad
+                gamma = xp.where(giver == i, upward, 2 * math.pi - upward)
+                there = space.in_world(space.chart.at_angle(gamma))
+                place = there if place is None else one_where(asked & (taken == number), there, place)
         return place
 
-    def _on_axis_mm(self, base_distance_mm: float, gamma_min_rad: float, fraction: Array, upwards: Array) -> Array:
-        xp = namespace(fraction)
-        width = 2 * (math.pi - gamma_min_rad)
-        upward = gamma_min_rad + fraction * width
-        gamma = xp.where(upwards, upward, 2 * math.pi - upward)
-        x_mm = -(base_distance_mm / 2) / xp.tan(gamma / 2)
-        return xp.stack([x_mm, 0 * x_mm], -1)
-
-    def _movers(self, plan: Plan, index: int) -> tuple[Array, Array]:
-        """The arm that moves the object ``index`` transfers after the first, and the one after that."""
+    def _movers(self, plan: Plan, index: int) -> tuple[Array, Array, Array]:
+        """The arm that moves the object ``index`` transfers after the first, the one after that, and the arc of their hand-over."""
         numpy = isinstance(plan.walk, (np.ndarray, np.generic))
         key = None if numpy else plan.walk.device
         if key not in self._tables:
-            self._tables[key] = self._walk_table if numpy else plan.walk.new_tensor(self._walk_table.tolist())
-        table = self._tables[key]
-        last = table.shape[1] - 1
-        return table[plan.walk, min(index, last)], table[plan.walk, min(index + 1, last)]
+            self._tables[key] = self._way_table if numpy else plan.walk.new_tensor(self._way_table.tolist())
+        arms, arcs = self._tables[key]
+        last = arms.shape[1] - 1
+        return arms[plan.walk, min(index, last)], arms[plan.walk, min(index + 1, last)], arcs[plan.walk, min(index, last)]
 
     @cached_property
-    def _walk_table(self) -> Any:
-        """Arms of all walks (walks, max_steps); what comes after a walk's end repeats its last arms, to and fro."""
+    def _way_table(self) -> Any:
+        """Arms, and arcs taken, of all ways (2, ways, max_steps); what comes after a walk's end repeats its last arms, to and fro."""
         longest = max(len(walk) for walk in self.walks)
         rows = []
-        for walk in self.walks:
-            row = list(walk)
-            while len(row) < longest:
-                row.append(self.rules.cell.graph.neighbours(row[-1])[0])
-            rows.append(row)
-        return np.array(rows)
+        for way in self._ways:
+            arms = list(way.walk)
+            while len(arms) < longest:
+                arms.append(self.rules.cell.graph.neighbours(arms[-1])[0])
+            rows.append((arms, [*way.arcs, *[0] * (longest - len(way.arcs))]))
+        return np.array(rows).swapaxes(0, 1)
 
     def act(self, pose: Array, goal: Array, epsilon_rad: float | None = None) -> Array:
         """The optimal next action, for :meth:`~marl_handover.task.rules.Rules.decode`; in closed loop this re-plans at every step."""
         xp, cell = namespace(pose), self.rules.cell
         plan = self.plan(pose, goal, epsilon_rad)
         place_mm = self.hand_over_mm(plan, 0)
-        giver, receiver = self._movers(plan, 0)
+        giver, receiver, _ = self._movers(plan, 0)
         one = xp.ones_like(plan.fraction)
         final = xp.where(plan.transfers == 1, one, -one)
         chart = xp.stack([0 * one, 0 * one], -1)

@@ -22,18 +22,20 @@ def sample_positions(cell: Cell, count: int, generator: torch.Generator, dtype: 
     rows, sizes = [], []
     for each in cell.arms:
         low, span, turn = each.r_min_mm**2, each.r_max_mm**2 - each.r_min_mm**2, each.yaw_rad[1] - each.yaw_rad[0]
-        rows.append((each.base.x_mm, each.base.y_mm, each.base.facing_rad, low, span, each.yaw_rad[0], turn))
+        rows.append((each.base.x_mm, each.base.y_mm, each.base.facing_rad, low, span, each.yaw_rad[0], turn, each.lateral_mm))
         sizes.append(span * turn)
     of_arm = torch.tensor(rows, dtype=dtype, device=device)
-    alike = all(row[3:] == rows[0][3:] for row in rows)
+    alike, beside = all(row[3:] == rows[0][3:] for row in rows), any(row[7] for row in rows)
     shares = torch.tensor([sum(sizes[: index + 1]) / sum(sizes) for index in range(len(sizes) - 1)], dtype=dtype, device=device)
     while missing > 0:
         draw = math.ceil(1.5 * missing) + 8
         uniform = torch.rand(3, draw, generator=generator, dtype=dtype, device=device)
         arm = torch.bucketize(uniform[0], shares, right=True)
-        low_mm2, span_mm2, yaw, yaws = rows[0][3:] if alike else of_arm[arm, 3:].unbind(-1)
+        low_mm2, span_mm2, yaw, yaws = rows[0][3:7] if alike else of_arm[arm, 3:7].unbind(-1)
         radius = (low_mm2 + uniform[1] * span_mm2).sqrt()
         angle = of_arm[arm, 2] + yaw + uniform[2] * yaws
+        if beside:
+            angle = angle + torch.asin(of_arm[arm, 7] / radius)
         points = of_arm[arm, :2] + radius[:, None] * torch.stack([angle.cos(), angle.sin()], -1)
         owner = cell.reaches(points).to(torch.uint8).argmax(-1)
         points = points[owner == arm][:missing]

@@ -204,7 +204,7 @@ def sector_outline(cell: Cell, arm: int) -> Floats:
 def shared_mesh(cell: Cell) -> tuple[Floats, NDArray[np.uint32]]:
     """Vertices (n, 3) in mm and triangles (m, 3) of the space both arms reach: a strip between its two long sides."""
     alpha = np.linspace(-1.0, 1.0, _POINTS)
-    sides = np.stack([cell.chart.to_table(alpha, np.full(_POINTS, beta)) for beta in (-1.0, 1.0)], 1).reshape(-1, 2)
+    sides = np.stack([cell.shared.to_table(alpha, np.full(_POINTS, beta)) for beta in (-1.0, 1.0)], 1).reshape(-1, 2)
     vertices = np.concatenate([sides, np.full((len(sides), 1), _SHADE_MM)], -1)
     first = 2 * np.arange(_POINTS - 1)[:, None]
     faces = np.concatenate([first + [0, 2, 1], first + [1, 2, 3]])
@@ -215,8 +215,8 @@ def chart_lines(cell: Cell) -> list[Floats]:
     """Lines (n, 2) in mm of constant alpha and of constant beta."""
     values, along = np.linspace(-1.0, 1.0, _CHART_LINES), np.linspace(-1.0, 1.0, _POINTS)
     across = np.array([-1.0, 1.0])
-    lines = [cell.chart.to_table(along, np.full(_POINTS, beta)) for beta in values]
-    return lines + [cell.chart.to_table(np.full(2, alpha), across) for alpha in values[1:-1]]
+    lines = [cell.shared.to_table(along, np.full(_POINTS, beta)) for beta in values]
+    return lines + [cell.shared.to_table(np.full(2, alpha), across) for alpha in values[1:-1]]
 
 
 def _add_line(server: viser.ViserServer, name: str, points_mm: Floats, colour: str, height_mm: float, width_px: float) -> None:

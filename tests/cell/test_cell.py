@@ -106,7 +106,8 @@ def test_arms_are_mirror_images(cell):
     np.testing.assert_array_equal(cell.reaches(points), cell.reaches(mirrored)[:, ::-1])
     np.testing.assert_allclose(cell.polar(points)[1], -cell.polar(mirrored)[1][:, ::-1], atol=1e-12)
     assert cell.bases[LEFT].y_mm == -cell.bases[RIGHT].y_mm > 0
-    assert cell.arms[LEFT].mirror == -cell.arms[RIGHT].mirror
+    assert cell.views[LEFT].y_sign == cell.views[LEFT].turn_sign == -1
+    assert cell.views[RIGHT].y_sign == cell.views[RIGHT].turn_sign == 1
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -10,12 +10,12 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from marl_handover.cell import Chart
+from marl_handover.cell import PaperChart
 from marl_handover.errors import NoSharedSpace
 
 coordinate = st.floats(-1, 1)
 charts = st.builds(
-    lambda low, width, share: Chart(low, low + width, 2 * (low + share * width)),
+    lambda low, width, share: PaperChart(low, low + width, 2 * (low + share * width)),
     st.floats(50, 300),
     st.floats(5, 300),
     st.floats(0.05, 0.95),
@@ -24,7 +24,7 @@ LINE = np.concatenate([np.linspace(-1, 1, 201), [np.nextafter(1, 0), np.nextafte
 SQUARE = np.stack(np.meshgrid(LINE, LINE, indexing="ij"), -1).reshape(-1, 2)
 
 
-def distances(chart: Chart, position) -> np.ndarray:
+def distances(chart: PaperChart, position) -> np.ndarray:
     """Distance from both bases, by the definition of the shared space."""
     x_mm, y_mm = np.asarray(position, np.float64)[..., 0], np.asarray(position, np.float64)[..., 1]
     half = chart.base_distance_mm / 2
@@ -133,4 +133,4 @@ def test_inset_keeps_away_from_the_edge(paper):
 @pytest.mark.parametrize("distance_mm", [100.0, 300.0, 460.0, 1000.0, math.nan])
 def test_no_shared_space_is_named(distance_mm):
     with pytest.raises(NoSharedSpace, match=r"base_distance_mm = .*300.*460"):
-        Chart(150.0, 230.0, distance_mm)
+        PaperChart(150.0, 230.0, distance_mm)

@@ -132,7 +132,7 @@ def test_hand_over_field_names_the_place_where_the_other_arm_can_finish(cell, ru
     action[:, 0] = -1
     result = rules.step(pose, goal, previous, action)
     arm, rows = result.command.arm, np.arange(COUNT)
-    sign = np.array([arm.mirror for arm in cell.arms])[arm]
+    sign = np.array([view.turn_sign for view in cell.views])[arm]
     seen = observe(rules, "relative", pose, goal, previous)
     needed = sign * np.arctan2(field(seen, "sin_hand_over"), field(seen, "cos_hand_over"))[rows, arm]
     psi = cell.gripper_yaw(cell.polar(result.placed)[1])
