@@ -147,6 +147,9 @@ class PaperChart:
 SAMPLES = 4001
 """Hand-over angles at which the shared space is looked for; a piece between two of them is found where it is widest."""
 
+GAP = 1e-3
+"""Between what two arcs have of alpha: one half of it belongs to the end of either, so that rounding does not change the arc."""
+
 _NARROW_MM = 1e-9
 _QUARTER = math.pi / 2
 
@@ -158,9 +161,10 @@ class AngleChart:
     """The angle chart of any two annulus sectors: alpha is the hand-over angle, beta says where among the places that have it.
 
     With a_1 and a_2 the angles at the bases from the base line to the grippers' directions, both counted towards +x, the hand-over angle is
-    gamma = pi + eta with eta = a_1 + a_2. ``alpha`` maps onto the arcs of eta by length, ``beta`` onto the difference of the distances,
-    second minus first, that the curve of eta offers. Distances are those in the arms' own vertical planes, R = sqrt(rho^2 - delta^2) with
-    the lateral offset delta. With D between the bases, phi = (a_2 - a_1) / 2 and h = eta / 2, the law of sines gives
+    gamma = pi + eta with eta = a_1 + a_2. ``alpha`` maps onto the arcs of eta by length, a :data:`GAP` between them; ``beta`` maps onto
+    the difference of the distances, second minus first, that the curve of eta offers. Distances are those in the arms' own vertical planes,
+    R = sqrt(rho^2 - delta^2) with the lateral offset delta. With D between the bases, phi = (a_2 - a_1) / 2 and h = eta / 2, the law of
+    sines gives
 
         R_1 - R_2 = (D sin(phi) - (delta_1 + delta_2) cos(h)) / sin(h)
         R_1 + R_2 = (D cos(phi) + (delta_1 - delta_2) sin(h)) / cos(h)
@@ -200,10 +204,10 @@ class AngleChart:
         xp, arcs = namespace(alpha), self._eta_arcs
         if len(arcs) == 1:
             return self._place(arcs[0][0] + alpha * (self.inset * arcs[0][1]), beta)
-        along, start, eta = (alpha + 1) * sum(half for _, half in arcs), 0.0, 0 * alpha
-        for centre, half in arcs:
-            eta = xp.where(along >= start, centre + self.inset * (along - start - half), eta)
-            start += 2 * half
+        eta = 0 * alpha
+        for (centre, half), middle in zip(arcs, self._middles, strict=True):
+            there = (alpha - middle) * self._stretch
+            eta = xp.where(there >= -half - self._stretch * GAP / 2, centre + self.inset * xp.clip(there, -half, half), eta)
         return self._place(eta, beta)
 
     def from_table(self, position_mm: Array) -> tuple[Array, Array]:
@@ -214,11 +218,10 @@ class AngleChart:
         xp, arcs = namespace(position_mm), self._eta_arcs
         (r_1, a_1), (r_2, a_2) = self._seen(position_mm)
         eta = a_1 + a_2
-        start, total, alpha = 0.0, sum(half for _, half in arcs), 0 * eta
-        for number, (centre, half) in enumerate(arcs):
+        alpha = 0 * eta
+        for number, ((centre, half), middle) in enumerate(zip(arcs, self._middles, strict=True)):
             begins = -math.inf if number == 0 else (sum(arcs[number - 1]) + centre - half) / 2
-            alpha = xp.where(eta >= begins, ((eta - centre) / self.inset + start + half) / total - 1, alpha)
-            start += 2 * half
+            alpha = xp.where(eta >= begins, middle + (eta - centre) / (self.inset * self._stretch), alpha)
         low, high = self._bounds(eta)
         half_mm = self.inset * (high - low) / 2
         some, one = half_mm > _NARROW_MM, xp.ones_like(eta)
@@ -291,6 +294,20 @@ class AngleChart:
         there = (self._distance_mm * xp.sin(phi) - sum(self._lateral_mm) * xp.cos(h)) / sin_h
         least = (sin_h > 0) == (at_most == (arm == 0))
         return xp.where(least, xp.maximum(low, there), low), xp.where(least, high, xp.minimum(high, there))
+
+    @cached_property
+    def _stretch(self) -> float:
+        """Radians of eta for one of alpha."""
+        return sum(half for _, half in self._eta_arcs) / (1 - GAP * (len(self._eta_arcs) - 1) / 2)
+
+    @cached_property
+    def _middles(self) -> list[float]:
+        """Alpha in the middle of each arc."""
+        found, start = [], -1.0
+        for _, half in self._eta_arcs:
+            found.append(start + half / self._stretch)
+            start += 2 * half / self._stretch + GAP
+        return found
 
     @cached_property
     def _distance_mm(self) -> float:
