@@ -53,7 +53,8 @@ def brute_force(arms, start, goal, epsilon_rad):
     shared = grid[in_sector(arms[0], grid) & in_sector(arms[1], grid)]
     assume(len(shared) > 300)
     angles = np.sort(np.remainder(psi(arms[0], shared) - psi(arms[1], shared), 2 * math.pi))
-    some = np.unique(np.concatenate([angles[:: max(1, len(angles) // 1000)], angles[-1:]]))
+    bins = np.floor(angles / 0.005)  # the first and the last angle of each 0.3 degrees: ends of intervals are among them
+    some = angles[np.r_[True, bins[1:] != bins[:-1]] | np.r_[bins[1:] != bins[:-1], True]]
     sums = {1: {0: np.zeros(1), 1: np.zeros(1)}, 2: {0: angles, 1: -angles}}
     sums[3] = dict.fromkeys((0, 1), (some[:, None] - some[None, :]).ravel())
     best = np.full(len(start), 4)
