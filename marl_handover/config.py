@@ -170,6 +170,8 @@ class CellConfig:
     shapes: str | None = chosen(None, SHAPES)
     grid_mm: float = bounded(5.0, 1.0, 200.0)
     fit_rounding_mm: float = bounded(1.0, 0.0, 100.0)  # fitted radii are rounded inwards to a multiple of this; 0 keeps them
+    r_min_mm: float | None = bounded(None, 1.0, 10_000.0)  # rings begin no nearer than this ...
+    r_max_mm: float | None = bounded(None, 1.0, 10_000.0)  # ... and end no farther; null: what the arms reach
     chart: str | None = chosen(None, CHARTS)  # of what two arms share; null: the paper's for equal rings, else by hand-over angles
     chart_inset: float = bounded(1.0, 0.1, 1.0)  # part of the chart that is used: 1 = all, 0.95 leaves room for placement noise
     block: BlockConfig = field(default_factory=BlockConfig)

@@ -70,7 +70,7 @@ def build_cell(config: CellConfig) -> CellModel:
         alike = [index for index, each in enumerate(robots) if each == robot]
         if not grid.masks[alike].any():
             require_grasps(models[robot], settings[robot].pick_height_mm, config.block)
-        fits[robot] = fit_annulus(grid, config.fit_rounding_mm, arms=alike)
+        fits[robot] = fit_annulus(grid, config.fit_rounding_mm, arms=alike, within_mm=(config.r_min_mm, config.r_max_mm))
     listed = []
     for name, base, robot in zip(names, bases, robots, strict=True):
         fit, height_mm = fits[robot], settings[robot].pick_height_mm

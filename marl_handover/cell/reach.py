@@ -153,13 +153,21 @@ def _require_moderate(arms: Sequence[ArmModel], cell: CellConfig, bases: Sequenc
         raise InvalidSetting("grid_mm", cell.grid_mm, limit)
 
 
-def fit_annulus(grid: ManipulationGrid, rounding_mm: float = 0.0, weight: float = 1000.0, arms: Sequence[int] | None = None) -> AnnulusFit:
+def fit_annulus(
+    grid: ManipulationGrid,
+    rounding_mm: float = 0.0,
+    weight: float = 1000.0,
+    arms: Sequence[int] | None = None,
+    within_mm: tuple[float | None, float | None] = (None, None),
+) -> AnnulusFit:
     """Fit one sector of an annulus to the points of ``arms`` (None: all) together, seen from their bases.
 
     The radii, then the yaws, are the contiguous run that maximises (reachable points - ``weight`` x unreachable points), in turn until
-    nothing changes. Then the radii are rounded inwards to a multiple of ``rounding_mm`` (0: not at all).
+    nothing changes. Then the radii are rounded inwards to a multiple of ``rounding_mm`` (0: not at all), and kept ``within_mm``, beyond
+    which no point counts.
 
-    Raises :class:`InvalidSetting` on ``pick_height_mm`` if no point can be reached, and on ``fit_rounding_mm`` if rounding leaves nothing.
+    Raises :class:`InvalidSetting` on ``pick_height_mm`` if no point can be reached, on ``fit_rounding_mm`` if rounding leaves nothing, and
+    on ``r_min_mm`` or ``r_max_mm`` if nothing is within them.
     """
     require_at_least("fit_rounding_mm", rounding_mm, 0)
     chosen = list(range(len(grid.bases))) if arms is None else list(arms)
@@ -180,10 +188,21 @@ def fit_annulus(grid: ManipulationGrid, rounding_mm: float = 0.0, weight: float 
         if new_radii == radii and new_yaws == yaws:
             break
         radii, yaws = new_radii, new_yaws
-    r_min, r_max = _rounded_inwards(new_radii, rounding_mm)
+    r_min, r_max = _kept_within(_rounded_inwards(new_radii, rounding_mm), within_mm)
+    good &= _between(radius, (within_mm[0] or 0.0, within_mm[1] or math.inf), LENGTH_TOLERANCE_MM)
     inside = _between(radius, (r_min, r_max), LENGTH_TOLERANCE_MM) & _between(yaw, yaws, ANGLE_TOLERANCE_RAD)
     false_inside = float(np.mean(~good[inside])) if inside.any() else 0.0
-    return AnnulusFit(r_min, r_max, yaws[0], yaws[1], false_inside, float(np.mean(~inside[good])))
+    missed = float(np.mean(~inside[good])) if good.any() else 0.0
+    return AnnulusFit(r_min, r_max, yaws[0], yaws[1], false_inside, missed)
+
+
+def _kept_within(radii: tuple[float, float], within_mm: tuple[float | None, float | None]) -> tuple[float, float]:
+    least, most = within_mm
+    low, high = max(radii[0], least or 0.0), min(radii[1], most or math.inf)
+    if low >= high:
+        name, value = ("cell.r_max_mm", most) if most is not None and most <= radii[0] else ("cell.r_min_mm", least)
+        raise InvalidSetting(name, value, f"so that some of {radii[0]:g} to {radii[1]:g} mm, where the arm reaches, is left")
+    return low, high
 
 
 def _between(values: Floats, interval: tuple[float, float], tolerance: float) -> Bools:

@@ -63,12 +63,19 @@ def workspace_summary(model: CellModel) -> dict[str, Any]:
         "grid_mm": cell.config.grid_mm,
         "grid_points": {**points, "both": int(masks.all(0).sum())},
         "bound_by": {
-            "r_min": bound_by(model.arm, fit.r_min_mm - cell.config.grid_mm, cell.pick_height_mm, cell.config.block),
-            "r_max": bound_by(model.arm, fit.r_max_mm + cell.config.grid_mm, cell.pick_height_mm, cell.config.block),
+            "r_min": _bound(model, fit.r_min_mm, -cell.config.grid_mm, "r_min_mm"),
+            "r_max": _bound(model, fit.r_max_mm, cell.config.grid_mm, "r_max_mm"),
         },
         "ignored_pairs": [list(pair) for pair in model.arm.description.ignored],
         "fit": {"false_inside_rate": fit.false_inside_rate, "missed_rate": fit.missed_rate},
     }
+
+
+def _bound(model: CellModel, radius_mm: float, beyond_mm: float, key: str) -> str:
+    """What the ring ends at: a setting of the cell, or whatever keeps the arm from going a step ``beyond_mm``."""
+    if radius_mm == getattr(model.cell.config, key):
+        return f"cell.{key}"
+    return bound_by(model.arm, radius_mm + beyond_mm, model.cell.pick_height_mm, model.cell.config.block)
 
 
 def _text(summary: dict[str, Any]) -> str:

@@ -25,7 +25,7 @@ MARGIN_MM = 3.0
 
 GRID_RAD = math.radians(4.0)
 
-TURNS = 24
+TURNS, GRASP_SLACK_MM = 24, 0.1
 """At so many orientations of the block, over half a turn, its distance to the hand that grasps it is looked at."""
 
 
@@ -139,7 +139,7 @@ def arm_collision_model(model: CellModel, motion: MotionConfig, index: int) -> C
     levers = _levers_mm(planar, held, limits)
     bare_pairs = all_pairs[all_pairs.max(axis=1) < len(capsules)]
     at_grasp = _at_grasp_mm(capsules[capsules[:, 0] >= 4], held[len(capsules) :], arm)
-    near = np.clip(at_grasp, -COVER_MM, motion.block_clearance_mm)
+    near = np.clip(at_grasp - GRASP_SLACK_MM, -COVER_MM, motion.block_clearance_mm)
     return CollisionModel(planar, capsules, bare_pairs, held, all_pairs, edges, limits, float(levers[0]), levers, near)
 
 
