@@ -12,7 +12,7 @@ from mkdocs.structure.files import File, Files
 
 import marl_handover
 from marl_handover.cli import COMMANDS, PROGRAM
-from marl_handover.compose_help import KeyRow, key_rows
+from marl_handover.schema import KeyRow, key_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 STORED = "bench/results"

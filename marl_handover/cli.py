@@ -137,8 +137,8 @@ def _dispatch(name: str, arguments: list[str]) -> int:
 
 def _run(command: Command, module: Any, name: str, arguments: list[str], begun: tuple[Any, ...]) -> int:
     from marl_handover.compose import compose
-    from marl_handover.compose_help import keys_help
     from marl_handover.progress import showing
+    from marl_handover.schema import keys_help
 
     if any(argument in ("--help", "-h") for argument in arguments):
         print(f"usage: {PROGRAM} {name} [key=value ...]\n\n{command.summary}\n\n{keys_help(module.SCHEMA, module.ALIASES, module.GROUPS)}")

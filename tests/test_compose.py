@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marl_handover.compose import compose, from_yaml, to_yaml
-from marl_handover.compose_help import keys_help
 from marl_handover.config import CellConfig, TaskConfig
 from marl_handover.errors import BadOverride, CorruptFile, MissingFile, UnknownChoice, UnknownKey
+from marl_handover.schema import keys_help
 
 
 class Colour(enum.Enum):

@@ -260,6 +260,7 @@ class DecentralisedSac(HybridSac):
     """
 
     kind = "turns"
+    stored = ("losses", "average", "actor_optimizer", "critic_optimizer", "temperature_optimizer")
 
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
         Algorithm.__init__(self, rules, config, generator)  # the base class would make a supervisor's networks
@@ -296,16 +297,6 @@ class DecentralisedSac(HybridSac):
     def about(self) -> dict[str, Any]:
         """As the base class, and what kind of learners."""
         return {**super().about(), "learners": self.learners}
-
-    def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
-        """The losses hold all networks and the temperatures."""
-        return {
-            "losses": self.losses,
-            "average": self.average,
-            "actor_optimizer": self.actor_optimizer,
-            "critic_optimizer": self.critic_optimizer,
-            "temperature_optimizer": self.temperature_optimizer,
-        }
 
     def _branches(self, actors: nn.Module, observation: Tensor) -> ActionDistribution:
         """What the arms whose turn it is say, by ``actors``, of :func:`~marl_handover.envs.decentralised.own_view` (n, VIEW_SIZE)."""

@@ -79,6 +79,7 @@ class Dqn(Algorithm):
     """Networks, TorchRL's losses and the grid."""
 
     kind = "discrete"
+    stored = ("losses", "optimizer")
     config: DqnConfig
 
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
@@ -104,10 +105,6 @@ class Dqn(Algorithm):
         loss = DQNLoss(actor, action_space="categorical", double_dqn=True, loss_function="smooth_l1")
         loss.make_value_estimator(gamma=self.config.gamma)
         return loss
-
-    def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
-        """The losses hold networks and targets."""
-        return {"losses": self.losses, "optimizer": self.optimizer}
 
     def state_dict(self) -> dict[str, Any]:
         """As the base class, and how far exploration and pre-training are."""

@@ -69,6 +69,7 @@ class FlatSac(Algorithm):
     """SAC as the paper used it, with the usual target entropy: minus the number of numbers."""
 
     kind = "box"
+    stored = ("loss", "actor_optimizer", "value_optimizer", "temperature_optimizer")
     config: FlatSacConfig
 
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
@@ -86,15 +87,6 @@ class FlatSac(Algorithm):
     def actor(self) -> nn.Module:
         """The network from observation to action parameters; its first outputs are the mean before the tanh."""
         return self.loss.net
-
-    def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
-        """The loss module holds all networks and the temperature."""
-        return {
-            "loss": self.loss,
-            "actor_optimizer": self.actor_optimizer,
-            "value_optimizer": self.value_optimizer,
-            "temperature_optimizer": self.temperature_optimizer,
-        }
 
     @torch.no_grad()
     def explore(self, observation: Tensor) -> Tensor:

@@ -58,10 +58,6 @@ class Ppo(Algorithm):
         self.advantage = GAE(gamma=self.config.gamma, lmbda=self.config.gae_lambda, value_network=value)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=self.config.learning_rate, fused=True)
 
-    def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
-        """Loss module (actor and value) and optimiser."""
-        return {"loss": self.loss, "optimizer": self.optimizer}
-
     def actor(self) -> nn.Module:
         """The network from observation to action parameters; its first outputs are the mean before the tanh."""
         return self.net

@@ -50,6 +50,7 @@ class Td3(Algorithm):
     """TD3: deterministic policy, delayed, with smoothed targets; TorchRL's own loss."""
 
     kind = "box"
+    stored = ("loss", "actor_optimizer", "value_optimizer")
     config: Td3Config
 
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
@@ -68,10 +69,6 @@ class Td3(Algorithm):
         self.actor_optimizer = torch.optim.Adam(list(loss.actor_network_params.flatten_keys().values()), lr=rate, fused=True)
         self.value_optimizer = torch.optim.Adam(list(loss.qvalue_network_params.flatten_keys().values()), lr=rate, fused=True)
         self.updates = 0
-
-    def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
-        """Loss module (actor, values, targets) and optimisers."""
-        return {"loss": self.loss, "actor_optimizer": self.actor_optimizer, "value_optimizer": self.value_optimizer}
 
     def actor(self) -> nn.Module:
         """The network from observation to action before the tanh."""

@@ -19,7 +19,7 @@ from marl_handover.cell.chart import Chart, PaperChart
 from marl_handover.cell.shared_space import HandoverGraph, SharedSpace
 from marl_handover.cell.symmetry import ARM_LETTERS, Symmetry, View, pair_views, symmetries
 from marl_handover.config import CellConfig
-from marl_handover.errors import InvalidSetting, TwoArmsOnly, UnconnectedArms, UnequalArms
+from marl_handover.errors import InvalidSetting, OutOfReach, TwoArmsOnly, UnconnectedArms, UnequalArms
 from marl_handover.geometry.se2 import SE2
 
 
@@ -205,6 +205,13 @@ class Cell:
     def reaches(self, position_mm: Array) -> Array:
         """Which arms can place at positions (..., >= 2): bool (..., num_arms)."""
         return self.within(*self.polar(position_mm))
+
+    def require_reached(self, what: str, pose: Array) -> None:
+        """Raise :class:`OutOfReach` unless an arm reaches the pose ``what``, (2,) or (3,) in mm and rad."""
+        with np.errstate(over="ignore"):  # of absurd coordinates; infinitely far is out of reach too
+            reached = bool(self.reaches(np.asarray(pose, float)).any())
+        if not reached:
+            raise OutOfReach(what, (float(pose[0]), float(pose[1])), self.r_min_mm, self.r_max_mm)
 
     def clamp_to_workspace(self, pose: Array, slack_mm: float) -> Array:
         """``pose`` (3,) as a supervisor is to see it.

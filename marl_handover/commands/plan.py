@@ -28,7 +28,7 @@ from marl_handover.config import (
     path_field,
     seed_field,
 )
-from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, WorkFailed, counted
+from marl_handover.errors import InvalidSetting, NotFinite, UnknownChoice, WorkFailed, counted
 from marl_handover.policies import SupervisorPolicy, adapted
 from marl_handover.task.episode import advance
 from marl_handover.task.planner import ExactPlanner
@@ -82,10 +82,7 @@ def run(config: PlanConfig) -> int:
     policy = _policy(config)
     rules = policy.rules
     for name, pose in poses.items():
-        with np.errstate(over="ignore"):  # of absurd coordinates; infinitely far is out of reach too
-            reached = bool(rules.cell.reaches(pose).any())
-        if not reached:
-            raise OutOfReach(name, (float(pose[0]), float(pose[1])), rules.cell.r_min_mm, rules.cell.r_max_mm)
+        rules.cell.require_reached(name, pose)
     planner = _planner(config, policy)
     plan = solve(policy, poses["start"], poses["goal"])
     print(_text(plan, rules))

@@ -25,7 +25,7 @@ from marl_handover.config import (
     seed_field,
 )
 from marl_handover.control.settings import WorkcellConfig
-from marl_handover.errors import InvalidSetting, MissingFile, OutOfReach, counted
+from marl_handover.errors import InvalidSetting, MissingFile, counted
 
 if TYPE_CHECKING:
     from marl_handover.control.closed_loop import ClosedLoop
@@ -123,8 +123,7 @@ def _pose(name: str, value: list[float] | None, rules: Rules) -> Floats | None:
     if value is None:
         return None
     pose = np.array([value[0], value[1], np.radians(value[2])])
-    if not rules.cell.reaches(pose[:2]).any():
-        raise OutOfReach(name, (pose[0], pose[1]), rules.cell.r_min_mm, rules.cell.r_max_mm)
+    rules.cell.require_reached(name, pose)
     return pose
 
 

@@ -9,11 +9,9 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from marl_handover import policies
 from marl_handover.arrays import Floats, wrap
-from marl_handover.cell import Cell, build_cell
+from marl_handover.cell import build_cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import (
     CELL_ALIASES,
@@ -27,7 +25,7 @@ from marl_handover.config import (
     path_field,
     seed_field,
 )
-from marl_handover.errors import InvalidSetting, OutOfReach, WorkFailed, counted
+from marl_handover.errors import InvalidSetting, WorkFailed, counted
 from marl_handover.policies.policy import NobodyMoves
 from marl_handover.progress import Bar
 from marl_handover.task.rules import Outcome
@@ -87,7 +85,8 @@ def run(config: SimulateCommand) -> int:
     policy = policies.adapted(config.policy, config.cell, config.seed, **vars(config.task))
     policy.require_executors()
     for name in ("start", "goal"):
-        _require_reach(policy.rules.cell, name, getattr(config, name))
+        if (pose := getattr(config, name)) is not None:
+            policy.rules.cell.require_reached(name, pose)
     model = build_cell(policy.rules.cell.config)
     camera = view(config.view, model.cell)
     backend = BulletBackend(model, config.motion, grasp=config.grasp, gui=config.gui, camera=camera, size=size)
@@ -119,11 +118,6 @@ def _check(config: SimulateCommand) -> None:
     config.motion.validate()
     if config.video:
         require_video("video", config.video)
-
-
-def _require_reach(cell: Cell, name: str, pose: list[float] | None) -> None:
-    if pose is not None and not cell.reaches(np.array(pose)).any():
-        raise OutOfReach(name, (pose[0], pose[1]), cell.r_min_mm, cell.r_max_mm)
 
 
 @contextmanager

@@ -13,14 +13,14 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from marl_handover.cell import Cell, load_cell
-from marl_handover.compose import closest_first
 from marl_handover.config import CellConfig, TaskConfig, require_choice
-from marl_handover.envs.problem_source import ProblemSource
-from marl_handover.envs.top_view import TopView
+from marl_handover.envs.backends import TopView
 from marl_handover.errors import InvalidSetting, NotFinite, UnknownKey
 from marl_handover.motion.path_length_table import motion_cost
+from marl_handover.schema import closest_first
 from marl_handover.task.episode import advance
 from marl_handover.task.observations import observation_size, observe
+from marl_handover.task.problems import ProblemSource
 from marl_handover.task.rules import Outcome, Rules
 
 Observation = dict[str, NDArray[np.float32]]

@@ -23,11 +23,11 @@ from marl_handover.cell import CellModel, build_cell, cell_config
 from marl_handover.config import CellConfig, LoopConfig, MotionConfig, NoiseConfig, TaskConfig, require_between, require_choice
 from marl_handover.envs.backends import Backend, Correctable, KinematicBackend, make_backend
 from marl_handover.envs.cycle_check import FAILURES, CycleCheck, Refusal
-from marl_handover.envs.problem_source import ProblemSource
 from marl_handover.envs.spaces import SUPERVISOR, Spaces, read_command, read_cycle
 from marl_handover.motion.executor import ARM_AGENTS
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.episode import conclude, final_transfer, measured_verdict
+from marl_handover.task.problems import ProblemSource
 from marl_handover.task.rules import Command, Outcome, Rules, Verdict
 
 Observation = dict[str, Any]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from marl_handover.compose import from_yaml, option_names
+from marl_handover.compose import from_yaml
 from marl_handover.config import MotionConfig, RobotConfig
 from marl_handover.errors import MissingFile, UnknownChoice
 from marl_handover.files import expanded, resource_path
@@ -14,6 +14,7 @@ from marl_handover.geometry.capsules import touching_links
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.link_shapes import with_shapes
 from marl_handover.geometry.urdf import ArmDescription, read_urdf
+from marl_handover.schema import option_names
 
 _YAML = (".yaml", ".yml")
 

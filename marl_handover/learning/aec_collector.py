@@ -34,9 +34,8 @@ from marl_handover.envs.flat_aec import FlatAEC, FlatHandover, fields_of
 from marl_handover.envs.spaces import SUPERVISOR, Spaces
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.errors import HandoverError, WorkFailed, first_line
-from marl_handover.learning.aec_transitions import TransitionReader
 from marl_handover.learning.algorithm import Algorithm
-from marl_handover.learning.collector import Collected, Collector, Explore
+from marl_handover.learning.collector import Collected, Collector, Explore, TransitionReader
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.variant import make_variant
 from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent

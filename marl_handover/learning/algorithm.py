@@ -113,6 +113,9 @@ class Algorithm(ABC):
 
     kind: ClassVar[str]
 
+    stored: ClassVar[tuple[str, ...]] = ("loss", "optimizer")
+    """Names of the attributes whose state a checkpoint must hold: networks with their losses, and optimisers."""
+
     config: AlgorithmConfig
 
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
@@ -137,9 +140,9 @@ class Algorithm(ABC):
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Learn from a batch; return detached scalars to log."""
 
-    @abstractmethod
     def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
         """Everything whose state a checkpoint must hold, by name."""
+        return {name: getattr(self, name) for name in self.stored}
 
     @abstractmethod
     def actor(self) -> nn.Module:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from marl_handover.arrays import Floats, wrap
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.errors import CorruptFile, NotFinite, OutOfReach
+from marl_handover.errors import CorruptFile, NotFinite
 from marl_handover.files import read_bounded
 from marl_handover.parsing import LINES_BYTES, parse_object
 from marl_handover.task.episode import Act, Decision, Episodes, Noise, Observer, conclude, play
@@ -61,8 +61,7 @@ def read_problems(rules: Rules, path: Path) -> tuple[Floats, Floats]:
             what = f"{key} in line {number} of {path}"
             if not np.isfinite(value).all():
                 raise NotFinite(what, value.tolist())
-            if not rules.cell.reaches(value).any():
-                raise OutOfReach(what, (value[0], value[1]), rules.cell.r_min_mm, rules.cell.r_max_mm)
+            rules.cell.require_reached(what, value)
             poses[key].append(np.concatenate([value[:2], np.atleast_1d(wrap(value[2]))]))
     if not poses["state"]:
         raise CorruptFile("problems file", path, "it holds no problem")

@@ -186,6 +186,7 @@ class HybridSac(Algorithm):
     """Networks, optimisers and temperatures around :class:`HybridSacLoss`."""
 
     kind = "hybrid"
+    stored = ("loss", "average", "actor_optimizer", "critic_optimizer", "temperature_optimizer")
     config: SacConfig
 
     def __init__(self, rules: Rules, config: TrainConfig, generator: torch.Generator) -> None:
@@ -243,16 +244,6 @@ class HybridSac(Algorithm):
         super().load_state_dict({**state, **older})
         if older:
             self.average.load_state_dict(self.trained().state_dict())
-
-    def modules(self) -> dict[str, nn.Module | torch.optim.Optimizer]:
-        """The loss module holds all networks that are trained, and the temperatures."""
-        return {
-            "loss": self.loss,
-            "average": self.average,
-            "actor_optimizer": self.actor_optimizer,
-            "critic_optimizer": self.critic_optimizer,
-            "temperature_optimizer": self.temperature_optimizer,
-        }
 
     @torch.no_grad()
     def explore(self, observation: Tensor) -> Tensor:

@@ -25,13 +25,13 @@ from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.compose import from_mapping
 from marl_handover.config import CellConfig
 from marl_handover.control.events import FAULTS
+from marl_handover.control.interactive.world_state import lying, projected
 from marl_handover.control.remote_control import MAX_AGE_S, SessionCommand
 from marl_handover.control.telemetry_reader import Reading, TelemetryReader
 from marl_handover.errors import HandoverError, counted
 from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.hardware.settings import ARMS
 from marl_handover.palette import ALERT, BLUE, GREY, INK, PAPER, YELLOW
-from marl_handover.viewer import live as live_words
 from marl_handover.viewer.scene import CellScene
 from marl_handover.viewer.words import DOING, at_once
 
@@ -240,7 +240,7 @@ class LivePage:
                     part(reading)
                 except Exception as error:  # as above
                     failed = failed or f"the session's state cannot be shown: {type(error).__name__}: {error}"
-            self._say("failure", self._failure, live_words.note(failed))
+            self._say("failure", self._failure, note(failed))
 
     def _follow(self, reading: Reading) -> None:
         """Another session: what was said of the one before does not hold for it."""
@@ -264,7 +264,7 @@ class LivePage:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        gui.add_html(live_words.BIG_RED)
+        gui.add_html(BIG_RED)
         self._headline = gui.add_html("")
         self._failure = gui.add_html("")
         stop = gui.add_button("STOP", color="red", hint="stops every servo where it is; cleared only at the cell, by hand")
@@ -350,7 +350,7 @@ class LivePage:
             return self._held
         if state["phase"] in _PUT_DOWN and state["doing"] == "moving":
             if self._held is not None:
-                return _lying(self._held)
+                return lying(projected(self._held))
             return flat_pose(*(state["plan"][0]["pose"] if state.get("plan") else pose))
         self._held = None
         return flat_pose(*pose)
@@ -358,8 +358,8 @@ class LivePage:
     def _tell(self, reading: Reading) -> None:
         """Texts and buttons, where they have changed."""
         state = reading.state
-        self._say("headline", self._headline, live_words.headline(reading))
-        self._say("stop", self._stop_note, live_words.note(self._stop_words(reading)))
+        self._say("headline", self._headline, headline(reading))
+        self._say("stop", self._stop_note, note(self._stop_words(reading)))
         if state is None:
             return
         steered = bool(state["view_control"]) and reading.live
@@ -367,16 +367,16 @@ class LivePage:
         for handle, usable in ((self._start, steered and waiting), (self._pause, steered and not waiting), (self._send, steered)):
             if handle.disabled == usable:
                 handle.disabled = not usable
-        self._say("steering", self._steering, live_words.note(self._trouble or self._steering_words(reading)))
+        self._say("steering", self._steering, note(self._trouble or self._steering_words(reading)))
         if "episode" not in state:
             return
         label = _camera_label(reading)
         if self._camera.label != label:
             self._camera.label = label
-        self._say("facts", self._facts, live_words.facts(state))
-        self._say("arms", self._arms, live_words.arms(state))
-        self._say("plan", self._plan, live_words.plan(state))
-        self._say("log", self._log, live_words.log(self._events))
+        self._say("facts", self._facts, facts(state))
+        self._say("arms", self._arms, arms(state))
+        self._say("plan", self._plan, plan(state))
+        self._say("log", self._log, log(self._events))
 
     def _stop_words(self, reading: Reading) -> str:
         """What became of a stop that was asked for here."""
@@ -433,9 +433,3 @@ def _picking(cell: Cell, arm: int, pose: list[float]) -> Floats:
     """T_world_grip (4, 4) of an arm that takes the block at ``pose`` (3,): level, at the height where blocks are held."""
     yaw = float(cell.gripper_yaw(cell.polar(np.array(pose[:2], float))[1])[arm])
     return transform((pose[0], pose[1], cell.pick_heights_mm[arm]), (0.0, 0.0, yaw))
-
-
-def _lying(T_world_block: Floats) -> Floats:
-    """The same block on the table."""
-    yaw = math.atan2(T_world_block[1, 0], T_world_block[0, 0])
-    return flat_pose(float(T_world_block[0, 3]), float(T_world_block[1, 3]), yaw)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import viser
 from numpy.typing import ArrayLike
+from viser.transforms import SO3
 
 from marl_handover.arrays import Floats
 from marl_handover.cell.symmetry import ARM_LETTERS
@@ -34,32 +35,17 @@ def rgb(colour: str) -> Colour:
 
 def quaternion(axis: Sequence[float], angle_rad: float) -> Floats:
     """The turn (4,) by ``angle_rad`` about a unit vector."""
-    half = angle_rad / 2
-    return np.array([math.cos(half), *(math.sin(half) * component for component in axis)])
+    return np.asarray(SO3.exp(angle_rad * np.asarray(axis, float)).wxyz, float)
 
 
 def product(first: Floats, second: Floats) -> Floats:
     """The turn (4,) that makes ``second`` and then ``first``."""
-    w, v, a, b = first[0], first[1:], second[0], second[1:]
-    return np.array([w * a - v @ b, *(w * b + a * v + np.cross(v, b))])
+    return np.asarray((SO3(first) @ SO3(second)).wxyz, float)
 
 
 def turned(R: Floats) -> Floats:
     """The quaternion (4,) of a rotation matrix (3, 3)."""
-    # Of the four components the largest is found without loss of accuracy; the others follow from it.
-    squares = np.array([1 + np.trace(R), *(1 + 2 * R[i, i] - np.trace(R) for i in range(3))])
-    largest = int(np.argmax(squares))
-    sums = np.array(
-        [
-            [0.0, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
-            [R[2, 1] - R[1, 2], 0.0, R[1, 0] + R[0, 1], R[0, 2] + R[2, 0]],
-            [R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], 0.0, R[2, 1] + R[1, 2]],
-            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2], 0.0],
-        ]
-    )
-    row = sums[largest]
-    row[largest] = squares[largest]
-    return np.asarray(row / (2 * math.sqrt(squares[largest])))
+    return np.asarray(SO3.from_matrix(R).wxyz, float)
 
 
 def yaw_of(wxyz: Floats) -> float:

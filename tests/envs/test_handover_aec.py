@@ -19,8 +19,7 @@ from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import LoopConfig, MotionConfig, NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.control.closed_loop import make_loop
 from marl_handover.envs import SupervisorEnv, handover_aec
-from marl_handover.envs.backends import KinematicBackend, Refusal
-from marl_handover.envs.top_view import GOAL
+from marl_handover.envs.backends import GOAL, KinematicBackend, Refusal
 from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, UnknownKey
 from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.motion.path_length_table import motion_cost

@@ -17,7 +17,7 @@ from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import TaskConfig
 from marl_handover.envs import handover_aec
-from marl_handover.learning.aec_transitions import TransitionReader
+from marl_handover.learning.collector import TransitionReader
 from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.task.rules import Rules
 

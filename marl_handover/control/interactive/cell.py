@@ -20,7 +20,7 @@ from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig, require_at_least, require_seed
 from marl_handover.control.interactive.controller import InteractiveController, Placement, PolicyAdapter
 from marl_handover.control.interactive.world_state import projected
-from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach
+from marl_handover.errors import InvalidSetting, NotFinite
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import SupervisorPolicy
 
@@ -239,11 +239,7 @@ class InteractiveCell:
             raise InvalidSetting(what, np.shape(pose), "three numbers: x_mm, y_mm, yaw_rad")
         if not np.isfinite(array).all():
             raise NotFinite(what, array.tolist())
-        cell = self.model.cell
-        with np.errstate(over="ignore"):
-            reached = bool(cell.reaches(array).any())
-        if not reached:
-            raise OutOfReach(what, (float(array[0]), float(array[1])), cell.r_min_mm, cell.r_max_mm)
+        self.model.cell.require_reached(what, array)
         array[2] = wrap(array[2])
         return array
 
