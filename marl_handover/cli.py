@@ -22,7 +22,7 @@ EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 1, 2, 130, 141
 
 
 class Command(NamedTuple):
-    """Where a command lives. The module also offers ``SCHEMA``, ``ALIASES`` and ``GROUPS``.
+    """Where a command lives. The module also offers ``SCHEMA``, ``ALIASES``, ``GROUPS``, and ``POSITIONAL``: the key of a bare first word.
 
     ``first`` names a module whose ``at_once(arguments)`` is called before anything else is imported; the function gets what it returned as
     a second argument.
@@ -39,6 +39,7 @@ COMMANDS: dict[str, Command] = {
         "versions, devices, cameras and serial ports; what is missing and how to install it", "marl_handover.commands.doctor"
     ),
     "workspace": Command("the cell's grid, annulus fit and chart, as JSON and a picture", "marl_handover.commands.workspace"),
+    "robot": Command("how a URDF is read as an arm: roles of its joints, ring, gripper, what was assumed", "marl_handover.commands.robot"),
     "plan": Command("solve one problem: the sequence, its cost and every intermediate pose", "marl_handover.commands.plan"),
     "train": Command("train a supervisor into a run directory", "marl_handover.commands.train"),
     "evaluate": Command("play episodes with a policy: table, JSON, trace", "marl_handover.commands.evaluate"),
@@ -143,6 +144,8 @@ def _run(command: Command, module: Any, name: str, arguments: list[str], begun: 
     if any(argument in ("--help", "-h") for argument in arguments):
         print(f"usage: {PROGRAM} {name} [key=value ...]\n\n{command.summary}\n\n{keys_help(module.SCHEMA, module.ALIASES, module.GROUPS)}")
         return 0
+    if arguments and "=" not in arguments[0] and not arguments[0].startswith("-") and hasattr(module, "POSITIONAL"):
+        arguments = [f"{module.POSITIONAL}={arguments[0]}", *arguments[1:]]
     for argument in arguments:
         if argument.startswith("-"):
             raise BadOverride(argument, "options are written key=value, without dashes; see --help")

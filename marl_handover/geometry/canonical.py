@@ -23,7 +23,9 @@ from marl_handover.geometry.skeleton import Skeleton
 from marl_handover.geometry.urdf import ARM_JOINTS, ArmDescription, Joint, JointSource, Link, Mesh, Primitive, UrdfTree, Vector
 
 _EXACT_MM = 1e-9
-_FK_NOTE_MM = 0.01
+_AHEAD_MM = 20.0
+PITCHES_DEG = (-15.0, -30.0, -45.0, -60.0, -75.0, -85.0, 0.0, 15.0, 30.0)
+"""Of a hand, that are tried where the asked one has no ring."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,12 @@ class _Reading:
     limits: Floats
     planar: Floats
     ring_mm: tuple[float, float] | None
-    points_ahead: bool
+    ahead_mm: float
+
+    def has_ring(self, config: RobotConfig) -> bool:
+        """Whether it has one at any pitch of the hand."""
+        pitches = [math.radians(pitch - config.pitch_deg) for pitch in (config.pitch_deg, *PITCHES_DEG)]
+        return any(ring_by_limits_mm(self.planar, self.limits, config.pick_height_mm, pitch) is not None for pitch in pitches)
 
     @property
     def width_mm(self) -> float:
@@ -58,10 +65,8 @@ def canonical_arm(tree: UrdfTree, config: RobotConfig) -> ArmDescription:
     for roles in find_roles(skeleton, config):
         hand = find_hand(skeleton, roles, config)
         require_pitch(config, len(roles.joints) == 5)
-        both = [_read(skeleton, roles, hand, config, side) for side in (1.0, -1.0)]
-        both.sort(key=lambda each: (-round(each.width_mm), not each.points_ahead))
-        readings.append(both[0])
-        if both[0].ring_mm is not None:
+        readings.append(_front([_read(skeleton, roles, hand, config, side) for side in (1.0, -1.0)], config))
+        if readings[-1].ring_mm is not None:
             break
     reading = next((each for each in readings if each.ring_mm is not None), readings[0])
     notes = (
@@ -70,8 +75,16 @@ def canonical_arm(tree: UrdfTree, config: RobotConfig) -> ArmDescription:
     )
     if _is_canonical(skeleton, reading, config):
         joints = tuple(replace(joint, mimic=None) if joint.name in ARM_JOINTS else joint for joint in tree.joints)
-        return ArmDescription(tree.path, tree.name, tree.root, reading.hand.tip, tree.links, joints, reading.hand.gripper, assumed=notes)
+        made = ArmDescription(tree.path, tree.name, tree.root, reading.hand.tip, tree.links, joints, reading.hand.gripper)
+        return replace(made, tip=made.grasp_link, assumed=notes)
     return _description(skeleton, reading, config, notes)
+
+
+def _front(both: list[_Reading], config: RobotConfig) -> _Reading:
+    """The side that is the front: where the grip is at the URDF's zero, else that of the wider ring, or of the root's +x."""
+    sides = sorted(both, key=lambda each: (-round(each.width_mm), -round(float(each.T_root_base[0, 0]), 6)))
+    clear = [each for each in sides if each.ahead_mm > _AHEAD_MM and each.has_ring(config)]
+    return (clear or sides)[0]
 
 
 def _read(skeleton: Skeleton, roles: Roles, hand: Hand, config: RobotConfig, side: float) -> _Reading:
@@ -88,6 +101,7 @@ def _read(skeleton: Skeleton, roles: Roles, hand: Hand, config: RobotConfig, sid
     T_base_root = np.linalg.inv(T_root_base)
     shoulder, elbow, wrist = (T_base_root @ frames[joint.child][:, 3] for joint in roles.joints[1:4])
     grip, ahead = T_base_root @ np.append(hand.grip_mm, 1.0), T_base_root[:3, :3] @ hand.approach
+    ahead_mm = float(grip[0])
     slopes = [math.atan2(to[2] - start[2], to[0] - start[0]) for start, to in ((shoulder, elbow), (elbow, wrist))]
     slopes += [math.atan2(ahead[2], ahead[0]) - math.radians(config.pitch_deg)]
     at_zero = [0.0, slopes[0], slopes[1] - slopes[0], slopes[2] - slopes[1]]
@@ -108,7 +122,7 @@ def _read(skeleton: Skeleton, roles: Roles, hand: Hand, config: RobotConfig, sid
     planar = np.concatenate([there[0], there[1] - there[0], there[2] - there[1], grip[[0, 2]] - there[2], grip[[1]]])
     table = np.array(limits)
     ring = ring_by_limits_mm(planar, table, config.pick_height_mm, 0.0)
-    return _Reading(roles, hand, T_root_base, tuple(sources), table, planar, ring, float(ahead[0]) > 0.0)
+    return _Reading(roles, hand, T_root_base, tuple(sources), table, planar, ring, ahead_mm)
 
 
 def _roll_source(roles: Roles, hand: Hand, axes: list[Floats], left: Floats) -> JointSource:
@@ -179,7 +193,8 @@ def _description(skeleton: Skeleton, reading: _Reading, config: RobotConfig, not
     links.append(Link(grip))
     joints.append(Joint(_free_name("grasp", skeleton), "fixed", last, grip, _vector(at), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
     gripper = replace(reading.hand.gripper, joints=tuple(_apart(name) for name in reading.hand.gripper.joints))
-    return ArmDescription(tree.path, tree.name, tree.root, grip, tuple(links), tuple(joints), gripper, reading.sources, notes)
+    made = ArmDescription(tree.path, tree.name, tree.root, grip, tuple(links), tuple(joints), gripper, reading.sources)
+    return replace(made, locked=tuple(roles.locked.items()), tip=reading.hand.tip, assumed=notes)
 
 
 def _pivot(reading: _Reading, role: str, T_base_file: Floats) -> Floats:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 from marl_handover.compose import from_yaml
 from marl_handover.config import MotionConfig, RobotConfig
-from marl_handover.errors import MissingFile, UnknownChoice
+from marl_handover.errors import MissingFile, UnknownChoice, UnsupportedKinematics
 from marl_handover.files import expanded, resource_path
-from marl_handover.geometry.canonical import canonical_arm, require_moving
+from marl_handover.geometry.canonical import PITCHES_DEG, canonical_arm, require_moving
 from marl_handover.geometry.capsules import touching_links
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.link_shapes import with_shapes
 from marl_handover.geometry.urdf import ArmDescription, read_urdf
 from marl_handover.schema import option_names
+
+LEAST_RING_MM = 20.0
+"""A ring that is narrower is none: no two arms share anything of it."""
 
 _YAML = (".yaml", ".yml")
 
@@ -63,13 +67,44 @@ def read_robot(config: RobotConfig) -> ClosedFormArm:
         MissingFile, UrdfError, UnsupportedKinematics: of a URDF that is none, or of another class.
         UnknownKey, InvalidSetting: of limits.
     """
-    description, limits = describe(config), config.joint_limits_deg
+    description = describe(config)
     require_moving(description, config)
-    arm = ClosedFormArm(description, limits)
-    shaped = with_shapes(arm, config.shapes)
-    arm = arm if shaped is description else ClosedFormArm(shaped, limits)
+    arm = ClosedFormArm(description, config.joint_limits_deg)
+    require_ring(arm, config)
+    return shaped_arm(arm, config)
+
+
+def shaped_arm(arm: ClosedFormArm, config: RobotConfig) -> ClosedFormArm:
+    """The arm with the collision shapes that its settings ask for.
+
+    Raises as :func:`~marl_handover.geometry.link_shapes.with_shapes` does.
+    """
+    limits, shaped = config.joint_limits_deg, with_shapes(arm, config.shapes)
+    arm = arm if shaped is arm.description else ClosedFormArm(shaped, limits)
     ignored = touching_links(arm, MotionConfig())
     return ClosedFormArm(replace(shaped, ignored=ignored), limits) if ignored else arm
+
+
+def require_ring(arm: ClosedFormArm, config: RobotConfig) -> None:
+    """Raise :class:`UnsupportedKinematics` for an arm whose joint limits leave it no ring at its pick height and pitch.
+
+    The line names the pitch nearest to that one that has a ring, if any has.
+    """
+    if _width_mm(arm.ring_mm(config.pick_height_mm)) >= LEAST_RING_MM:
+        return
+    asked = config.pitch_deg
+    others = {pitch: arm.ring_mm(config.pick_height_mm, math.radians(pitch - asked)) for pitch in PITCHES_DEG}
+    wide = [pitch for pitch in sorted(others, key=lambda pitch: abs(pitch - asked)) if _width_mm(others[pitch]) >= LEAST_RING_MM]
+    how = "level" if asked == 0 else f"at {asked:g} deg"
+    fix = "change pick_height_mm"
+    if wide and (ring := others[wide[0]]) is not None:
+        fix = f"pitch_deg={wide[0]:g} has one of {ring[0]:.0f} to {ring[1]:.0f} mm"
+    what = f"its joint limits leave no ring in which the hand is {how} at pick_height_mm = {config.pick_height_mm:g}; {fix}"
+    raise UnsupportedKinematics(arm.description.path, what)
+
+
+def _width_mm(ring: tuple[float, float] | None) -> float:
+    return 0.0 if ring is None else ring[1] - ring[0]
 
 
 def describe(config: RobotConfig) -> ArmDescription:

@@ -250,6 +250,8 @@ def _explain(skeleton: Skeleton, hands: Sequence[str], config: RobotConfig) -> N
     path = skeleton.tree.path
     ways = [skeleton.path(body) for body in (hands or skeleton.moving)]
     chain = max(ways, key=len, default=[])
+    while chain and chain[-1].kind == "prismatic":  # a finger
+        chain = chain[:-1]
     names = listed([joint.name for joint in chain], 100)
     sliding = [joint.name for joint in chain[:4] if joint.kind == "prismatic"]
     if sliding:

@@ -192,6 +192,8 @@ class ArmDescription:
 
     Attributes:
         sources: of each of :data:`ARM_JOINTS`, the URDF's joint.
+        locked: the URDF's joints that are held, each with its angle in rad.
+        tip: the URDF's link by which the grip was found; empty where it was guessed otherwise.
         assumed: what the file does not say, and was taken to be so; in words.
         ignored: pairs of links that touch in every posture, such as shells of one housing; nobody asks how far they are apart.
     """
@@ -204,6 +206,8 @@ class ArmDescription:
     joints: tuple[Joint, ...]
     gripper: Gripper = Gripper()
     sources: tuple[JointSource, ...] = tuple(JointSource(name) for name in ARM_JOINTS)
+    locked: tuple[tuple[str, float], ...] = ()
+    tip: str = ""
     assumed: tuple[str, ...] = ()
     ignored: tuple[tuple[str, str], ...] = ()
 
