@@ -159,8 +159,9 @@ class ClosedFormArm:
             return T
         if joint.name in ARM_JOINTS:
             value = q[..., ARM_JOINTS.index(joint.name)]
-        else:  # what is no part of the gripper stays at its lower stop
-            value = np.asarray(self.description.gripper.joint_values(gripper_mm).get(joint.name, joint.lower))
+        else:  # what is no part of the gripper stays at 0, or at the stop that is nearest to it
+            still = min(max(0.0, joint.lower), joint.upper)
+            value = np.asarray(self.description.gripper.joint_values(gripper_mm).get(joint.name, still))
         if joint.kind == "prismatic":
             return np.asarray(T @ transform([float(value) * component for component in joint.axis], (0.0, 0.0, 0.0)))
         R_joint = rotation(value, joint.axis)
