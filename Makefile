@@ -69,7 +69,7 @@ format: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,peers,ompl]"
 	$(BIN)/python bench/motion.py
-	$(BIN)/python bench/gate.py commands=10000
+	$(BIN)/python bench/safety_filter.py commands=10000
 	$(BIN)/python bench/run.py
 
 docs: $(STAMP)

@@ -33,8 +33,8 @@ from marl_handover.control.settings import TwinConfig
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels, calibrate_lens, hung_camera
 from marl_handover.perception.detector import Detector
-from marl_handover.perception.markers import charuco_sheet
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
+from marl_handover.perception.printables import charuco_sheet
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.perception.settings import BoardConfig, LookConfig, MountConfig
 

@@ -81,7 +81,7 @@ def run(config: CalibrateCommand) -> int:
 
 
 def _sheets(config: CalibrateCommand, model: CellModel) -> int:
-    from marl_handover.perception.markers import PX_PER_MM, marker_sheet, page, save_sheet, write_sheets
+    from marl_handover.perception.printables import PX_PER_MM, marker_sheet, page, save_sheet, write_sheets
 
     folder, cards, target = config.folder() / "sheets", config.hand_markers, config.target
     files = write_sheets(folder, model.cell.config.block, target, config.board, config.paper)

@@ -27,8 +27,8 @@ from marl_handover.hardware.settings import ARMS, GripperConfig
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.perception.calibration import CameraCalibration, Pixels, calibrate_lens
 from marl_handover.perception.camera import Camera
-from marl_handover.perception.markers import Sheet, charuco_sheet
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
+from marl_handover.perception.printables import Sheet, charuco_sheet
 from marl_handover.perception.settings import BoardConfig
 
 PLACES = ((0.0, 0.0, 0.0), (-90.0, 20.0, math.pi / 2), (90.0, -20.0, -math.pi / 2))

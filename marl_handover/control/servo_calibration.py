@@ -29,7 +29,7 @@ from marl_handover.hardware.safety_filter import CommandRejected, JointCommand
 from marl_handover.hardware.settings import ARMS
 from marl_handover.perception.calibration import CameraCalibration, Pixels
 from marl_handover.perception.camera import Camera
-from marl_handover.perception.markers import MarkerFinder
+from marl_handover.perception.detector import MarkerFinder
 from marl_handover.perception.settings import TargetConfig
 
 LEAST_SIGHTINGS = 8

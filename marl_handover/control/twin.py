@@ -21,7 +21,7 @@ from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.emulator.device import EmulatedCell, Fault
 from marl_handover.perception.calibration import Pixels, hung_camera
 from marl_handover.perception.camera import Frame, RenderedCamera
-from marl_handover.perception.markers import Sheet, marker_sheet
+from marl_handover.perception.printables import Sheet, marker_sheet
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.simulation.arm import SERVO_S
 from marl_handover.simulation.follower import ServoFollower, ServoState

@@ -17,7 +17,7 @@ from marl_handover.arrays import Floats
 from marl_handover.errors import CorruptFile, HandoverError, MissingFile, WorkFailed, counted
 from marl_handover.files import copy_whole, make_folder, write_whole
 from marl_handover.parsing import read_json
-from marl_handover.perception.markers import board_corners_mm, charuco_board
+from marl_handover.perception.printables import board_corners_mm, charuco_board
 from marl_handover.perception.settings import BoardConfig, MountConfig
 
 Pixels = NDArray[np.uint8]

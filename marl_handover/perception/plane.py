@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from marl_handover.geometry.se3 import apply, flat_pose
 from marl_handover.perception.calibration import BoardFinder, CalibrationFailed, CameraCalibration, Floats, Intrinsics, Pixels
-from marl_handover.perception.markers import MarkerFinder
+from marl_handover.perception.detector import MarkerFinder
 from marl_handover.perception.settings import BoardConfig
 
 LARGEST_ERROR_PX = 1.0

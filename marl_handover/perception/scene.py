@@ -18,7 +18,7 @@ from marl_handover.geometry.se2 import SE2
 from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.geometry.urdf import Primitive
 from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels
-from marl_handover.perception.markers import Sheet, block_top, marker_sheet
+from marl_handover.perception.printables import Sheet, block_top, marker_sheet
 from marl_handover.perception.settings import LookConfig, TargetConfig
 
 FINE = 4

@@ -8,7 +8,7 @@ import pytest
 from marl_handover.cli import main
 from marl_handover.control.settings import CardConfig, WorkcellConfig, twin_workcell
 from marl_handover.errors import InvalidSetting
-from marl_handover.perception.markers import dictionary
+from marl_handover.perception.printables import dictionary
 from marl_handover.perception.settings import MARKERS, CameraConfig, TargetConfig
 
 

@@ -11,8 +11,8 @@ import pytest
 from marl_handover.config import MotionConfig
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.calibration import CameraCalibration, calibrate_lens, hung_camera
-from marl_handover.perception.markers import charuco_sheet
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
+from marl_handover.perception.printables import charuco_sheet
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.perception.settings import BoardConfig, LookConfig, MountConfig
 

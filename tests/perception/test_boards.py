@@ -5,7 +5,15 @@ import pytest
 from marl_handover.config import BlockConfig
 from marl_handover.errors import InvalidSetting, UnknownChoice
 from marl_handover.perception.calibration import BoardFinder
-from marl_handover.perception.markers import OldOpenCV, block_top, board_corners_mm, charuco_sheet, dictionary, marker_cells, marker_sheet
+from marl_handover.perception.printables import (
+    OldOpenCV,
+    block_top,
+    board_corners_mm,
+    charuco_sheet,
+    dictionary,
+    marker_cells,
+    marker_sheet,
+)
 from marl_handover.perception.settings import BoardConfig, TargetConfig
 
 

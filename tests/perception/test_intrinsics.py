@@ -3,7 +3,7 @@ import pytest
 
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.calibration import CalibrationFailed, CameraCalibration, Intrinsics, calibrate_lens
-from marl_handover.perception.markers import charuco_sheet
+from marl_handover.perception.printables import charuco_sheet
 from marl_handover.perception.scene import Renderer, held_boards, sheet_shape
 
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from marl_handover.geometry.se3 import flat_pose
-from marl_handover.perception.markers import OPENED, PLAIN, MarkerFinder, opening_px
+from marl_handover.perception.detector import OPENED, PLAIN, MarkerFinder, opening_px
 
 EDGE_PX = 40.0
 

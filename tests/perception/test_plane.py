@@ -5,8 +5,8 @@ import pytest
 
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.calibration import CalibrationFailed, CalibrationMismatch
-from marl_handover.perception.markers import charuco_sheet, marker_sheet
 from marl_handover.perception.plane import BoardOnTable, locate_by_board, locate_by_markers
+from marl_handover.perception.printables import charuco_sheet, marker_sheet
 
 CORNERS = {10: (-210.0, -150.0), 11: (-200.0, 160.0), 12: (220.0, 10.0), 13: (190.0, 170.0)}
 

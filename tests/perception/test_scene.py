@@ -6,7 +6,7 @@ import pytest
 from marl_handover.config import MotionConfig
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.detector import Detector
-from marl_handover.perception.markers import board_corners_mm
+from marl_handover.perception.printables import board_corners_mm
 from marl_handover.perception.scene import block_shapes, held_boards
 from marl_handover.simulation.world import BulletCell
 

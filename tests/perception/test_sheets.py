@@ -7,7 +7,8 @@ from PIL import Image
 from marl_handover.config import BlockConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.perception.calibration import BoardFinder
-from marl_handover.perception.markers import PX_PER_MM, TABLE_MARKERS, MarkerFinder, write_sheets
+from marl_handover.perception.detector import MarkerFinder
+from marl_handover.perception.printables import PX_PER_MM, TABLE_MARKERS, write_sheets
 from marl_handover.perception.settings import BoardConfig
 
 

@@ -1,12 +1,12 @@
-"""The judge of bench/gate.py against the gate's own geometry, and a slice of what it judges."""
+"""The judge of bench/safety_filter.py against the gate's own geometry, and a slice of what it judges."""
 
 from __future__ import annotations
 
 import sys
 
-import gate as bench
 import numpy as np
 import pytest
+import safety_filter as bench
 
 from marl_handover.hardware.clearance import FAR_MM, alone_mm, arm_shapes, between_mm, still
 from marl_handover.hardware.safety_filter import JointCommand

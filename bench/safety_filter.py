@@ -1,6 +1,6 @@
 """The safety filter judged from outside: what it lets through, what it refuses for nothing, and what it costs against another commit.
 
-python bench/gate.py commands=100000 samples=1000 seed=0 against=ca43d75
+python bench/safety_filter.py commands=100000 samples=1000 seed=0 against=ca43d75
 
 Random commands of one and of two arms, of arms that stand or are in an earlier move, in half of them with the block in a hand that moves.
 Whatever the gate says, each is judged at ``samples`` postures of its way by kinematics and distances that are written here, from the URDF's
@@ -429,7 +429,7 @@ def costs(against: str, rounds: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         packed = subprocess.run(["git", "archive", against, "marl_handover", "urdf", "configs"], cwd=ROOT, capture_output=True, check=False)
         if packed.returncode:
-            sys.exit(f"gate.py: cannot use against={against!r}: {packed.stderr.decode().strip()}")
+            sys.exit(f"safety_filter.py: cannot use against={against!r}: {packed.stderr.decode().strip()}")
         subprocess.run(["tar", "x", "-C", folder], input=packed.stdout, check=True)
         track = Path(folder) / "track.npy"
         np.save(track, streamed())
