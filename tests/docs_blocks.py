@@ -127,6 +127,8 @@ def check_line(words: list[str]) -> None:
     """Raise unless the command exists and takes its keys and values."""
     command, *arguments = words[1:]
     module = importlib.import_module(COMMANDS[command].module)
+    if arguments and "=" not in arguments[0] and hasattr(module, "POSITIONAL"):
+        arguments = [f"{module.POSITIONAL}={arguments[0]}", *arguments[1:]]
     plugins, arguments = take_plugins(arguments)
     given = [argument for argument in arguments if argument != "--help" and not argument.startswith("debug=")]
     with added(plugins):
