@@ -161,8 +161,8 @@ class CellConfig:
 
     name: str = "paper"
     robot: str = path_field("al5a_paper")  # the name of a file in configs/robot, or the path of a robot's YAML file or URDF
-    arms: list[ArmConfig] = sized(list, 0, 16)  # one entry an arm; empty: a mirrored pair, its bases base_distance_mm apart
-    base_distance_mm: float = bounded(360.0, 10.0, 10_000.0)
+    arms: list[ArmConfig] = sized(list, 0, 16)  # one entry an arm; empty, or two that are not placed: face to face, base_distance_mm apart
+    base_distance_mm: float | None = bounded(None, 10.0, 10_000.0)  # null: 0.78 of the sum of the outer radii, if that gives a shared space
     grasp_link: str = ""  # the robots' tip
     pick_height_mm: float | None = bounded(None, 0.1, 1000.0)
     pitch_deg: float | None = bounded(None, -90.0, 90.0)

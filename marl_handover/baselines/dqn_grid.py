@@ -61,7 +61,7 @@ def seen_by_finishers(rules: Rules, layout: str, observation: Array) -> Array:
         return xp.stack([xp.concat([blocks[..., arm, :], blocks[..., 1 - arm, :]], -1) for arm in (LEFT, RIGHT)], -2)
     cell = rules.cell
     first = RAW_FIELDS.index("goal_x")
-    extent = cell.r_max_mm, cell.r_max_mm + cell.config.base_distance_mm / 2
+    extent = cell.r_max_mm, cell.r_max_mm + cell.base_distance_mm / 2
     goal = xp.stack([observation[..., first] * extent[0], observation[..., first + 1] * extent[1]], -1)
     square, yaw = cell.polar(goal)
     held = wrap(observation[..., first + 2, None] * math.pi - cell.gripper_yaw(yaw))
@@ -76,7 +76,7 @@ def goal_reach(rules: Rules, layout: str, observation: Array) -> Array:
         blocks = observation.reshape(*observation.shape[:-1], -1, len(ARM_FIELDS))
         return blocks[..., ARM_FIELDS.index("reaches_goal")] > 0.5
     cell, first = rules.cell, RAW_FIELDS.index("goal_x")
-    extent = cell.r_max_mm, cell.r_max_mm + cell.config.base_distance_mm / 2
+    extent = cell.r_max_mm, cell.r_max_mm + cell.base_distance_mm / 2
     goal = namespace(observation).stack([observation[..., first] * extent[0], observation[..., first + 1] * extent[1]], -1)
     return cell.reaches(goal)
 

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
+
+import numpy as np
 
 from marl_handover.cell.arm import Arm, mirrored_pair
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.reach import AnnulusFit, ManipulationGrid, fit_annulus, manipulation_grid, require_grasps
+from marl_handover.cell.shared_space import SharedSpace
 from marl_handover.compose import from_yaml, to_yaml
 from marl_handover.config import CellConfig, RobotConfig, require_choice
-from marl_handover.errors import InvalidSetting, UnequalArms
+from marl_handover.errors import InvalidSetting, NoSharedSpace, UnequalArms
 from marl_handover.files import expanded, resource_path
 from marl_handover.geometry.capsules import base_radius_mm
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.robot import read_robot, robot_config
 from marl_handover.geometry.se2 import SE2
+
+SPREAD = 0.78
+"""Distance between two bases, as a part of the sum of their outer radii: 360 mm for the paper's ring."""
 
 
 class CellModel(NamedTuple):
@@ -59,43 +65,109 @@ def build_cell(config: CellConfig) -> CellModel:
         InvalidSetting, MissingFile, UrdfError, NoSharedSpace, UnconnectedArms: where a setting, the URDF or the geometry cannot be.
     """
     config.validate()
-    names, bases, robots = _standing(config)
+    names, robots = _named(config)
     settings = {robot: robot_of(config, robot) for robot in dict.fromkeys(robots)}
-    models = {robot: read_robot(each) for robot, each in settings.items()}
-    arms = tuple(models[robot] for robot in robots)
+    kinds = {robot: _Kind(each, read_robot(each)) for robot, each in settings.items()}
+    if config.base_distance_mm is None and _face_to_face(config):
+        config = replace(config, base_distance_mm=_automatic_distance_mm(config, names, robots, kinds))
+    bases = _bases(config)
+    arms = tuple(kinds[robot].model for robot in robots)
     _require_apart(names, bases, arms)
     grid = manipulation_grid(arms, config, bases, [settings[robot].pick_height_mm for robot in robots])
+    fits = _fits(config, grid, robots, kinds)
+    each = tuple(fits[robot] for robot in robots), tuple(settings[robot] for robot in robots)
+    return CellModel(Cell(_arms(names, bases, robots, fits, kinds), config), arms, grid, *each)
+
+
+class _Kind(NamedTuple):
+    """A robot of the cell: settings and kinematics."""
+
+    settings: RobotConfig
+    model: ClosedFormArm
+
+    @property
+    def lateral_mm(self) -> float:
+        """What is beside the plane by no more than rounding is in it."""
+        return self.model.lateral_mm if abs(self.model.lateral_mm) > 1e-6 else 0.0
+
+
+def _fits(config: CellConfig, grid: ManipulationGrid, robots: Sequence[str], kinds: Mapping[str, _Kind]) -> dict[str, AnnulusFit]:
+    """The sector of each robot, over all its arms."""
     fits = {}
-    for robot in settings:
+    for robot, kind in kinds.items():
         alike = [index for index, each in enumerate(robots) if each == robot]
         if not grid.masks[alike].any():
-            require_grasps(models[robot], settings[robot].pick_height_mm, config.block)
-        fits[robot] = fit_annulus(grid, config.fit_rounding_mm, arms=alike, within_mm=(config.r_min_mm, config.r_max_mm))
+            require_grasps(kind.model, kind.settings.pick_height_mm, config.block)
+        within = config.r_min_mm, config.r_max_mm
+        fits[robot] = fit_annulus(grid, config.fit_rounding_mm, arms=alike, lateral_mm=kind.lateral_mm, within_mm=within)
+    return fits
+
+
+def _arms(
+    names: Sequence[str],
+    bases: Sequence[SE2],
+    robots: Sequence[str],
+    fits: Mapping[str, AnnulusFit],
+    kinds: Mapping[str, _Kind],
+) -> tuple[Arm, ...]:
     listed = []
     for name, base, robot in zip(names, bases, robots, strict=True):
-        fit, height_mm = fits[robot], settings[robot].pick_height_mm
+        fit, kind = fits[robot], kinds[robot]
         yaw = fit.yaw_lower_rad, fit.yaw_upper_rad
-        listed.append(Arm(name, base, fit.r_min_mm, fit.r_max_mm, yaw, robot, _lateral_mm(models[robot]), height_mm))
-    each = tuple(fits[robot] for robot in robots), tuple(settings[robot] for robot in robots)
-    return CellModel(Cell(tuple(listed), config), arms, grid, *each)
+        listed.append(Arm(name, base, fit.r_min_mm, fit.r_max_mm, yaw, robot, kind.lateral_mm, kind.settings.pick_height_mm))
+    return tuple(listed)
 
 
-def _lateral_mm(model: ClosedFormArm) -> float:
-    return float(getattr(model, "lateral_mm", 0.0))
+def _automatic_distance_mm(config: CellConfig, names: Sequence[str], robots: Sequence[str], kinds: Mapping[str, _Kind]) -> float:
+    """How far apart two arms face each other if nothing is said: :data:`SPREAD` of the sum of their outer radii, on whole centimetres.
+
+    Where there is no shared space with a chart then, or it is pinched in the middle, the nearest distance that gives one.
+
+    Raises :class:`NoSharedSpace` if none does.
+    """
+    fits: dict[str, AnnulusFit] = {}
+    for robot, kind in kinds.items():  # the ring does not depend on where the arm stands
+        alone = manipulation_grid([kind.model], config, [SE2(0.0, 0.0, (0.0, 1.0))], [kind.settings.pick_height_mm])
+        fits |= _fits(config, alone, [robot], {robot: kind})
+    one, other = (fits[robot] for robot in robots)
+    least, most = one.r_min_mm + other.r_min_mm, one.r_max_mm + other.r_max_mm
+    nominal = max(SPREAD * most, least + 0.25 * (most - least))
+    candidates = 10.0 * np.arange(1, int(most // 10) + 1)
+    for distance in candidates[np.argsort(abs(candidates - round(nominal, -1)), kind="stable")]:
+        first, second = _arms(names, mirrored_pair(float(distance)), robots, fits, kinds)
+        try:
+            _ = SharedSpace(first, second, 1.0, config.chart).chart.arcs
+        except (NoSharedSpace, InvalidSetting):
+            continue
+        return float(distance)
+    rings = " and ".join(f"{name} {fits[robot].r_min_mm:g} to {fits[robot].r_max_mm:g}" for name, robot in zip(names, robots, strict=True))
+    reason = f"none works for these rings ({rings} mm); choose another cell.pick_height_mm or cell.pitch_deg, which change them"
+    raise NoSharedSpace(nominal, one.r_min_mm, one.r_max_mm, reason)
 
 
-def _standing(config: CellConfig) -> tuple[tuple[str, ...], tuple[SE2, ...], tuple[str, ...]]:
-    """Name, base and robot of each arm."""
+def _face_to_face(config: CellConfig) -> bool:
+    """Whether the arms are two that stand :attr:`CellConfig.base_distance_mm` apart."""
+    return not config.arms or (len(config.arms) == 2 and all(arm.x_mm == arm.y_mm == arm.facing_deg == 0 for arm in config.arms))
+
+
+def _bases(config: CellConfig) -> tuple[SE2, ...]:
+    if _face_to_face(config):
+        assert config.base_distance_mm is not None
+        return mirrored_pair(config.base_distance_mm)
+    return tuple(SE2.facing_deg(arm.x_mm, arm.y_mm, arm.facing_deg) for arm in config.arms)
+
+
+def _named(config: CellConfig) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Name and robot of each arm."""
     if not config.arms:
-        return ("left", "right"), mirrored_pair(config.base_distance_mm), (config.robot, config.robot)
+        return ("left", "right"), (config.robot, config.robot)
     names = tuple(arm.name for arm in config.arms)
     for index, name in enumerate(names):
         if not name or name in names[:index]:
             raise InvalidSetting(f"cell.arms[{index}].name", name, "a name that no other arm has")
     if len(names) < 2:
         raise InvalidSetting("cell.arms", len(names), "two arms at least; without any: a mirrored pair")
-    bases = tuple(SE2.facing_deg(arm.x_mm, arm.y_mm, arm.facing_deg) for arm in config.arms)
-    return names, bases, tuple(arm.robot or config.robot for arm in config.arms)
+    return names, tuple(arm.robot or config.robot for arm in config.arms)
 
 
 def robot_of(config: CellConfig, robot: str) -> RobotConfig:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from marl_handover.arrays import wrap
+from marl_handover.cell.arm import lateral_rad
 from marl_handover.config import BlockConfig, CellConfig, MotionConfig, RobotConfig, check_bounds, require_at_least
 from marl_handover.errors import InvalidSetting, UrdfError
 from marl_handover.geometry.arm_model import ArmModel
@@ -158,13 +160,14 @@ def fit_annulus(
     rounding_mm: float = 0.0,
     weight: float = 1000.0,
     arms: Sequence[int] | None = None,
+    lateral_mm: float = 0.0,
     within_mm: tuple[float | None, float | None] = (None, None),
 ) -> AnnulusFit:
     """Fit one sector of an annulus to the points of ``arms`` (None: all) together, seen from their bases.
 
     The radii, then the yaws, are the contiguous run that maximises (reachable points - ``weight`` x unreachable points), in turn until
     nothing changes. Then the radii are rounded inwards to a multiple of ``rounding_mm`` (0: not at all), and kept ``within_mm``, beyond
-    which no point counts.
+    which no point counts. Yaws are those of the joint, of arms whose grip is ``lateral_mm`` to the left of their plane.
 
     Raises :class:`InvalidSetting` on ``pick_height_mm`` if no point can be reached, on ``fit_rounding_mm`` if rounding leaves nothing, and
     on ``r_min_mm`` or ``r_max_mm`` if nothing is within them.
@@ -177,6 +180,8 @@ def fit_annulus(
         limit = "a height at which the arm, its gripper level, reaches part of the table; here it reaches no grid point"
         raise InvalidSetting("pick_height_mm", grid.pick_heights_mm[chosen[0]], limit)
     radius, yaw = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
+    if lateral_mm:
+        yaw = wrap(yaw - lateral_rad(lateral_mm, radius))
     score = np.where(good, 1.0, -weight)
     yaws = (float(yaw[good].min()), float(yaw[good].max()))
     radii: tuple[float, float] | None = None

@@ -204,7 +204,7 @@ def settings_key(cell: Cell, motion: MotionConfig, arm: int = 0) -> str:
 def _shape(config: CellConfig, robot: RobotConfig) -> str:
     """What the lengths depend on of a pair and its robot, written as it was when cells had no robots: keys of kept tables stay valid."""
     usual = RobotConfig()
-    told = {"name": "", "urdf": "", "grasp_link": robot.tip, "base_distance_mm": config.base_distance_mm}
+    told: dict[str, Any] = {"name": "", "urdf": "", "grasp_link": robot.tip, "base_distance_mm": config.base_distance_mm}
     told |= {"pick_height_mm": robot.pick_height_mm, "joint_limits_deg": robot.joint_limits_deg}
     told |= {name: getattr(config, name) for name in ("grid_mm", "fit_rounding_mm")} | {"chart_inset": 1.0, "block": asdict(config.block)}
     told |= {name: value for name in ROBOT_SETTINGS if (value := getattr(robot, name)) != getattr(usual, name)}

@@ -117,13 +117,14 @@ def _relative(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsil
     views, space, skew = cell.views, cell.shared, cell.chart.skew_rad
     at, goal_at = space.in_frame(pose), space.in_frame(goal)
     square, yaw = cell.polar(pose)
+    one = xp.ones_like(yaw)
     goal_square, goal_yaw = cell.polar(goal)
     reach = cell.within(square, yaw) + 0.0 * yaw
     goal_reach = cell.within(goal_square, goal_yaw) + 0.0 * yaw
-    across, along, mirror = (
-        xp.stack([sign + 0 * pose[..., 0] for sign in signs], -1)
-        for signs in ([view.x_sign for view in views], [view.y_sign for view in views], [view.turn_sign for view in views])
-    )
+    mirror = xp.stack([view.turn_sign + 0 * pose[..., 0] for view in views], -1)
+    across, along = one, mirror
+    if any(view.x_sign < 0 for view in views):
+        across, along = (xp.stack([view[axis] + 0 * pose[..., 0] for view in views], -1) for axis in range(2))
     turn = (pose[..., 2] - goal[..., 2])[..., None]
     finish = rules.orientation_error(turn + goal_yaw - yaw, 0 * turn)
     other_goal_psi = xp.flip(cell.gripper_yaw(goal_yaw), (-1,))
@@ -137,11 +138,10 @@ def _relative(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsil
     margin = goal_reach * (1 + xp.clip(MARGIN_SLOPE * (1 - abs(relative_error)), -1.0, 1.0)) - 1
     other_goal_reach = xp.flip(goal_reach, (-1,))
     was_previous = xp.stack([(previous_arm == index) + 0 * pose[..., 0] for index in range(cell.num_arms)], -1)
-    one = xp.ones_like(yaw)
     fields = [
-        across * at[..., 0:1] / scale,
+        at[..., 0:1] / scale * across,
         along * at[..., 1:2] / scale,
-        across * goal_at[..., 0:1] / scale,
+        goal_at[..., 0:1] / scale * across,
         along * goal_at[..., 1:2] / scale,
         reach,
         xp.flip(reach, (-1,)),
