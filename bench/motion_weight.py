@@ -89,7 +89,7 @@ def planned_mm(planner: MotionPlanner, arm: np.ndarray, start: np.ndarray, end: 
     lengths = np.full(len(arm), np.nan)
     for row in tqdm(range(len(arm)), desc="planned", leave=False):
         try:
-            lengths[row] = planner.transfer(int(arm[row]), start[row], end[row], planner.home_rad).length_mm
+            lengths[row] = planner.transfer(int(arm[row]), start[row], end[row], planner.others_home_rad(int(arm[row]))).length_mm
         except NoPath:
             continue
     return lengths, int(np.isnan(lengths).sum())

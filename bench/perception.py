@@ -31,6 +31,7 @@ from marl_handover.cell.build import CellModel, build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.control.settings import TwinConfig
 from marl_handover.geometry.se3 import flat_pose
+from marl_handover.motion.home import parked_poses
 from marl_handover.perception.calibration import CameraCalibration, Floats, Pixels, calibrate_lens, hung_camera
 from marl_handover.perception.detector import Detector
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
@@ -130,7 +131,7 @@ def see(painter: CellPainter, detector: Detector, pose: Floats, goal: Floats, pa
 def measure(values: dict[str, Any]) -> tuple[list[Result], list[float]]:
     """Results of all pictures; and how far off the calibrated map of the table is at worst, in mm, per camera."""
     model, random = build_cell(cell_config("paper")), np.random.default_rng(values["seed"])
-    parked = np.tile(np.radians(MotionConfig().parked_deg), (model.cell.num_arms, 1))
+    parked = parked_poses(model, MotionConfig())
     block = model.cell.config.block
     each = -(-values["frames"] // values["cameras"])
     results, maps = [], []

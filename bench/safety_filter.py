@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from marl_handover.cell.build import CellModel, build_cell, cell_config
 from marl_handover.compiled import compiled
-from marl_handover.config import MotionConfig
 from marl_handover.geometry.capsules import block_capsules, capsule_pairs
 from marl_handover.geometry.se3 import transform
 from marl_handover.geometry.urdf import ARM_JOINTS
@@ -401,7 +400,6 @@ TIMER = """
 import sys, time
 import numpy as np
 from marl_handover.cell.build import build_cell, cell_config
-from marl_handover.config import MotionConfig
 from marl_handover.hardware.calibration import nominal_calibration
 from marl_handover.hardware.safety_filter import JointCommand, SafetyFilter
 from marl_handover.hardware.settings import ARMS, HardwareConfig
@@ -409,7 +407,7 @@ from marl_handover.hardware.settings import ARMS, HardwareConfig
 track = np.load(sys.argv[1])
 model, config = build_cell(cell_config("paper")), HardwareConfig()
 gate = SafetyFilter(model, config, [nominal_calibration(config, arm, model.arm) for arm in ARMS])
-parked, costs, now_s = np.radians(MotionConfig().parked_deg), [], 1.0
+parked, costs, now_s = np.radians([0.0, 140.0, -115.0, 70.0, 0.0]), [], 1.0
 for _ in range(20):
     for arm in range(2):
         gate.refer(arm, parked, 12.0)
@@ -455,8 +453,8 @@ def costs(against: str, rounds: int) -> dict[str, Any]:
 
 def streamed() -> Floats:
     """Joints and fingers (n, 6) of a planned transfer, a row every 60 ms."""
-    parked = np.radians(MotionConfig().parked_deg)
-    motion = MotionPlanner(build_cell(cell_config("paper"))).pick_place(0, [0.0, 0.0], [30.0, -10.0], parked, parked)
+    planner = MotionPlanner(build_cell(cell_config("paper")))
+    motion = planner.pick_place(0, [0.0, 0.0], [30.0, -10.0], planner.home_rad, planner.home_rad)
     t_s = np.concatenate([phase.t_s for phase in motion.phases])
     columns = [
         *np.concatenate([phase.joints_rad for phase in motion.phases]).T,

@@ -15,6 +15,7 @@ from marl_handover import cli
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.geometry.se3 import flat_pose
+from marl_handover.motion.home import parked_poses
 from marl_handover.palette import YELLOW
 from marl_handover.perception.calibration import hung_camera
 from marl_handover.perception.detector import Detector
@@ -51,7 +52,7 @@ def twin_camera(path: Path) -> None:
     model, target = build_cell(cell_config("paper")), TargetConfig()
     camera = hung_camera(MountConfig(), (1280, 720))
     block = np.array([70.0, -15.0, math.radians(35)])
-    parked = np.tile(np.radians(MotionConfig().parked_deg), (2, 1))
+    parked = parked_poses(model, MotionConfig())
     image = CellPainter(model, camera, target).picture(flat_pose(*block), parked, np.array([-60.0, 25.0, math.radians(100)]))
     side_mm, height_mm = model.cell.config.block.side_mm, model.cell.config.block.height_mm
     seen = Detector(camera, model.cell.config.block, target).detect(image)

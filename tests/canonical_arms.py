@@ -6,7 +6,10 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from marl_handover.config import ArmConfig, CellConfig
+from marl_handover.config import CellConfig
+
+PARKED_DEG = [0.0, 140.0, -115.0, 70.0, 0.0]
+"""Where the AL5A parks."""
 
 LINKS = ("base_link", "turret", "upper_arm", "forearm", "wrist", "hand")
 JOINTS = ("base_yaw", "shoulder", "elbow", "wrist_pitch", "wrist_roll")
@@ -14,9 +17,10 @@ JOINTS = ("base_yaw", "shoulder", "elbow", "wrist_pitch", "wrist_roll")
 
 @dataclass(frozen=True)
 class ArmLengths:
-    """Lengths in mm and limits in degrees of an arm whose links lie along +x at zero; its hand is turned by ``pitch_deg`` there.
+    """Lengths in mm and limits in degrees of an arm whose links lie along +x at zero; its cell's hands are at ``pitch_deg``.
 
-    ``shoulder`` is (forward, up) from the foot of the yaw axis; ``lateral`` how far to the left of its plane the grip is.
+    ``shoulder`` is (forward, up) from the foot of the yaw axis; ``lateral`` how far to the left of its plane the grip is; ``hand``:
+    fingers or none.
     """
 
     name: str
@@ -30,6 +34,7 @@ class ArmLengths:
     thick: float = 18.0
     effort: float = 5.0
     distance: float = 400.0
+    hand: str = "fingers"
 
     def write(self, folder: Path) -> Path:
         """The arm as a URDF in ``folder``."""
@@ -39,34 +44,32 @@ class ArmLengths:
 
     def cell(self, folder: Path, **changes: object) -> CellConfig:
         """Two of it, facing each other, as far apart as :attr:`distance`."""
-        return CellConfig(**{"name": self.name, "robot": str(self.write(folder)), "base_distance_mm": self.distance, **changes})
+        at = {"pitch_deg": self.pitch_deg} if self.pitch_deg else {}
+        return CellConfig(**{"name": self.name, "robot": str(self.write(folder)), "base_distance_mm": self.distance, **at, **changes})
 
     def urdf(self) -> str:
         """The text of the file."""
-        turn = math.radians(self.pitch_deg)
-        forward, up = self.tool * math.cos(turn), self.tool * math.sin(turn)
         foot, t = self.shoulder[1] * 0.3, self.thick
-        # The roll axis is level and as low as the grip; wrist servo, hand and fingers follow the pitch.
         links = [
             _link("base_link", 0.3, _cylinder(0, 0, foot / 2, 30.0, foot)),
             _link("turret", 0.15, _box(self.shoulder[0] / 2, 0, (self.shoulder[1] - foot) / 2, 20, 24, 0.7 * (self.shoulder[1] - foot))),
             _link("upper_arm", 0.1, _box(self.upper / 2, 0, 0, self.upper - 1.2 * t, t, t)),
             _link("forearm", 0.1, _box(self.fore / 2, 0, 0, self.fore - 1.2 * t, t, t)),
-            _link("wrist", 0.05, _box(0.15 * forward, 0, 0.15 * up, 0.3 * self.tool, 18, 18, -turn)),
-            _link("hand", 0.05, _box(0.42 * forward, 0, -0.58 * up, 0.22 * self.tool, 40, 24, -turn)),
+            _link("wrist", 0.05, _box(0.15 * self.tool, 0, 0, 0.3 * self.tool, 18, 18)),
+            _link("hand", 0.05, _box(0.42 * self.tool, 0, 0, 0.22 * self.tool, 40, 24)),
             _link("grip", 0.001),
         ]
-        places = ((0, 0, foot), (self.shoulder[0], 0, self.shoulder[1] - foot), (self.upper, 0, 0), (self.fore, 0, 0), (0, 0, up))
+        places = ((0, 0, foot), (self.shoulder[0], 0, self.shoulder[1] - foot), (self.upper, 0, 0), (self.fore, 0, 0), (0, 0, 0))
         joints = [self._joint(index, place) for index, place in enumerate(places)]
-        for side, sign in (("left", 1), ("right", -1)):
-            x, z = 0.8 * forward, -0.2 * up
-            links.append(_link(f"finger_{side}_link", 0.006, _box(0, 2.0 * sign, 0, 0.4 * self.tool, 4, 12, -turn)))
+        for side, sign in (("left", 1), ("right", -1)) if self.hand == "fingers" else ():
+            share = 0.8 + 8.0 / self.tool  # fingers end 8 mm beyond the grip
+            links.append(_link(f"finger_{side}_link", 0.006, _box(0, 2.0 * sign, 0, 0.4 * self.tool, 4, 12)))
             joints.append(
                 f'<joint name="finger_{side}" type="prismatic"><parent link="hand"/><child link="finger_{side}_link"/>'
-                f'<origin xyz="{x / 1e3} {self.lateral / 1e3} {z / 1e3}"/><axis xyz="0 {sign} 0"/>'
+                f'<origin xyz="{share * self.tool / 1e3} {self.lateral / 1e3} 0"/><axis xyz="0 {sign} 0"/>'
                 '<limit lower="0" upper="0.016" effort="23" velocity="0.095"/></joint>'
             )
-        grip = f'<origin xyz="{forward / 1e3} {self.lateral / 1e3} 0"/>'
+        grip = f'<origin xyz="{self.tool / 1e3} {self.lateral / 1e3} 0"/>'
         joints.append(f'<joint name="grasp" type="fixed"><parent link="hand"/><child link="grip"/>{grip}</joint>')
         return f'<robot name="{self.name}">' + "\n".join(links + joints) + "</robot>"
 
@@ -80,9 +83,9 @@ class ArmLengths:
         )
 
 
-def _box(x: float, y: float, z: float, a: float, b: float, c: float, pitch_rad: float = 0.0) -> str:
+def _box(x: float, y: float, z: float, a: float, b: float, c: float) -> str:
     size = f"{a / 1e3} {b / 1e3} {c / 1e3}"
-    origin = f'<origin xyz="{x / 1e3} {y / 1e3} {z / 1e3}" rpy="0 {pitch_rad} 0"/>'
+    origin = f'<origin xyz="{x / 1e3} {y / 1e3} {z / 1e3}"/>'
     return f'<collision>{origin}<geometry><box size="{size}"/></geometry></collision>'
 
 
@@ -98,7 +101,7 @@ def _link(name: str, mass_kg: float, shape: str = "") -> str:
 
 SO101 = ArmLengths(
     "so101_like", (30.4, 119.0), 116.0, 135.0, 159.2,
-    {"base_yaw": (-110, 110), "shoulder": (-24, 176), "elbow": (-170, 23), "wrist_pitch": (-37, 153), "wrist_roll": (0, 0)},
+    {"base_yaw": (-110, 110), "shoulder": (-24, 176), "elbow": (-170, 23), "wrist_pitch": (-97, 93), "wrist_roll": (-90, 90)},
     pitch_deg=-60.0, lateral=-6.6, distance=540.0,
 )  # fmt: skip
 """Lengths of an SO-101 whose hand points 60 degrees down, its pads closing on a thin pin beside the roll axis."""
@@ -116,9 +119,3 @@ MEDIUM = ArmLengths(
     distance=420.0,
 )  # fmt: skip
 """An arm half as far-reaching again as the AL5A, its shoulder over the yaw axis."""
-
-
-def opposite(left: ArmLengths, right: ArmLengths, folder: Path, distance_mm: float) -> list[ArmConfig]:
-    """Two arms that face each other."""
-    files = (str(left.write(folder)), str(right.write(folder)))
-    return [ArmConfig("left", 0.0, distance_mm / 2, -90.0, files[0]), ArmConfig("right", 0.0, -distance_mm / 2, 90.0, files[1])]

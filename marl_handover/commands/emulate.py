@@ -6,8 +6,6 @@ import signal
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from marl_handover.config import path_field, require_choice, require_seed
 from marl_handover.errors import InvalidSetting, WorkFailed
 from marl_handover.hardware.settings import HardwareConfig
@@ -61,11 +59,13 @@ def _device(config: EmulateConfig) -> EmulatedDevice:
     from marl_handover.cell.build import build_cell, cell_config
     from marl_handover.config import MotionConfig
     from marl_handover.hardware.emulator.device import EmulatedCell, parse_faults
+    from marl_handover.motion.home import parked_poses
 
     require_seed(config.hardware.emulator.seed)
     require_choice("board", config.board, tuple(config.hardware.boards))
     faults = parse_faults(config.faults)
-    cell = EmulatedCell(config.hardware, build_cell(cell_config("paper")).arm, np.radians(MotionConfig().parked_deg))
+    model = build_cell(cell_config("paper"))
+    cell = EmulatedCell(config.hardware, model.arm, parked_poses(model, MotionConfig())[0])
     if config.board not in cell.devices:
         raise InvalidSetting("board", config.board, f"one that an arm is wired to: {', '.join(cell.devices)}")
     cell.devices[config.board].add_faults(faults)

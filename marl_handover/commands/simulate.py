@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -50,7 +51,7 @@ class SimulateCommand:
     cell: CellConfig | None = None  # single keys change the paper cell
     task: TaskChanges = field(default_factory=TaskChanges)  # but for the noise: physics decides
     motion: MotionConfig = field(default_factory=MotionConfig)
-    grasp: str = chosen("friction", ("friction", "constraint"))  # friction, or constraint: a rigid joint while both fingers are on the pin
+    grasp: str = chosen("friction", ("friction", "constraint"))  # of two pads; constraint: a rigid joint while both are on the pin
     video: str = path_field()  # .mp4 or .gif
     fps: float = bounded(12.5, 1.0, 50.0)  # of the video, in simulated time
     size: list[int] = bounded([640, 480], 16, 4096, (2, 2))  # of the video: width, height in pixels
@@ -90,6 +91,8 @@ def run(config: SimulateCommand) -> int:
     model = build_cell(policy.rules.cell.config)
     camera = view(config.view, model.cell)
     backend = BulletBackend(model, config.motion, grasp=config.grasp, gui=config.gui, camera=camera, size=size)
+    for note in backend.notes:
+        print(note, file=sys.stderr)
     try:
         with _recording(config, backend, policy.rules) as film:
             played = list(_episodes(config, policy, model, backend, film))

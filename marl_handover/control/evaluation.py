@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -142,6 +143,8 @@ def _play_loop(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool,
     options = backend_options(config)
     with make_loop(policy, config.backend, config.motion, config.loop, **options) as loop:
         rules, backend = loop.rules, loop.backend
+        for note in getattr(backend, "notes", ()):
+            print(note, file=sys.stderr)
         problems = _problems(config, rules)
         with _bar(problems, progress) as bar:
             played = play_problems(loop, problems, config.seed, bar.update)

@@ -19,6 +19,7 @@ from marl_handover.control.settings import WorkcellConfig
 from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.emulator.device import EmulatedCell, Fault
+from marl_handover.motion.home import parked_poses
 from marl_handover.perception.calibration import Pixels, hung_camera
 from marl_handover.perception.camera import Frame, RenderedCamera
 from marl_handover.perception.printables import Sheet, marker_sheet
@@ -46,7 +47,7 @@ class Twin:
         self.model, self.motion, self.config = model, motion, config
         self._random = np.random.default_rng(config.twin.seed)
         self.clock = VirtualClock()
-        self._parked = np.radians(motion.parked_deg)
+        self._parked = parked_poses(model, motion)[0]
         self.electronics = EmulatedCell(config.hardware, model.arm, self._parked, motion.finger_travel_mm)
         ports = self.electronics.mount(self.clock)
         self.hardware = replace(

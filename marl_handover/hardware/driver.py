@@ -32,6 +32,7 @@ from marl_handover.hardware.expected_pulses import SETTLED_S
 from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.hardware.ssc32 import LineRecord
+from marl_handover.motion.home import parked_poses
 
 
 class MoveRecord(NamedTuple):
@@ -82,7 +83,8 @@ class ArmDriver(ArmConnection):
         dry_run: bool = False,
     ) -> None:
         super().__init__(config, model, motion, clock=clock, latch=latch, dry_run=dry_run)
-        self.parked_rad = np.radians(np.asarray(self.motion.parked_deg, float))
+        said = self.motion.parked_deg  # whether the arms may go there is for the safety filter to say
+        self.parked_rad = parked_poses(model, self.motion)[0] if said is None else np.radians(np.asarray(said, float))
         self._confirm = confirm
 
     def __enter__(self) -> ArmDriver:

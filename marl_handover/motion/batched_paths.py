@@ -22,9 +22,10 @@ from marl_handover.config import CentralisedConfig, MotionConfig
 from marl_handover.geometry.capsules import segment_distance
 from marl_handover.geometry.closed_form import into_plane, pitch_frames, planar_ik
 from marl_handover.motion.collision_model import arm_collision_model, out_of_reach
-from marl_handover.motion.initial_guesses import RUN_UP_MM, SAMPLES, hand_pitch, proportions
+from marl_handover.motion.initial_guesses import RUN_UP_MM, SAMPLES, hand_pitch
 from marl_handover.motion.objective import first_moving
 from marl_handover.motion.planner import STILL_MM, MotionPlanner
+from marl_handover.motion.proportions import proportions
 from marl_handover.motion.trajectory import basis, sample_places, sampled_basis
 
 FIELDS = ("from_radius", "from_cos", "from_sin", "to_radius", "to_cos", "to_sin", "turn", "distance")

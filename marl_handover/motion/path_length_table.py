@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,8 @@ from marl_handover.cell.build import robot_of
 from marl_handover.config import CellConfig, MotionConfig, RobotConfig, TaskConfig
 from marl_handover.errors import CannotWrite, CorruptFile, HandoverError, MissingFile
 from marl_handover.files import MEGABYTE, cache_folder, package_path, read_arrays, writing
+from marl_handover.geometry.robot import read_robot
+from marl_handover.motion.home import parked_deg
 from marl_handover.progress import Bar
 from marl_handover.task.rules import MotionCost, straight_line_mm
 
@@ -38,7 +40,7 @@ Floats = NDArray[np.float64]
 
 LARGEST_BYTES = 64 * MEGABYTE
 SHIPPED = "pretrained/motion_cost.npz"
-ROBOT_SETTINGS = ("pitch_deg", "joints", "locked", "approach", "shapes", "parked_deg")
+ROBOT_SETTINGS = ("pitch_deg", "joints", "locked", "approach", "shapes")
 """Of a robot, that lengths depend on, besides its tip, limits and pick height."""
 RADII, YAWS, DISTANCES = 9, 25, 257
 """Nodes of the table along both radii, along the yaw between the places, and of the string along the distance."""
@@ -190,9 +192,12 @@ def settings_key(cell: Cell, motion: MotionConfig, arm: int = 0) -> str:
     """
     untimed = {"method", "velocity_scale", "acceleration_deg_s2", "sample_s", "grasp_s", "release_s"}
     older = {"num_initial_guesses": "starts"}  # keys of tables that are kept were made with this name
-    settings = sorted((older.get(name, name), value) for name, value in asdict(motion).items() if name not in untimed)
     cell.require_pair("a table of path lengths")
-    robot = robot_of(cell.config, cell.config.robot)
+    robot = robot_of(cell.config, cell.arms[0].robot)
+    parked = parked_deg(cell, motion, 0, robot, read_robot(robot))
+    settings = sorted(
+        (older.get(name, name), value) for name, value in asdict(replace(motion, parked_deg=parked)).items() if name not in untimed
+    )
     shape = _shape(cell.config, robot)
     digest = hashlib.sha256(repr((RADII, YAWS, DISTANCES, shape, settings)).encode())
     digest.update(Path(robot.urdf).read_bytes())

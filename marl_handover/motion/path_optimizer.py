@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from marl_handover.compiled import compiled
 from marl_handover.motion.collision_model import MARGIN_MM, CollisionModel, Scene, ball_around, out_of_reach
-from marl_handover.motion.initial_guesses import fit_control_points, proportions, random_bend, smoothing_metric
+from marl_handover.motion.initial_guesses import fit_control_points, random_bend, smoothing_metric
 from marl_handover.motion.objective import LEVER_MM, ROUNDING_MM, Margins, Penalty, columns, dense_margins, lagrangian
+from marl_handover.motion.proportions import proportions
 from marl_handover.motion.trajectory import NoPath, basis, sample_places, sampled_basis
 
 Floats = NDArray[np.float64]

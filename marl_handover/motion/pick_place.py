@@ -19,6 +19,9 @@ Floats = NDArray[np.float64]
 LIFTED_MM = 10.0
 """A grip this far above the pick height is no longer being lifted, and not yet being lowered: that names the phases, no more."""
 
+REACH_MM = 315.0
+"""How far an arm may reach that accelerates as fast as ``motion.acceleration_deg_s2`` says: the AL5A does."""
+
 JOINED_RAD = 1e-9
 """The end of a path and the beginning of the next are the same up to rounding."""
 
@@ -68,11 +71,14 @@ def timed_phases(paths: PickPlacePaths, arm: ArmModel, motion: MotionConfig, pic
 
 
 def motion_limits(arm: ArmModel, motion: MotionConfig) -> tuple[Floats, Floats]:
-    """Velocity and acceleration limits (5,) in rad/s and rad/s^2. Raises :class:`InvalidSetting`."""
+    """Velocity and acceleration limits (5,) in rad/s and rad/s^2; an arm that reaches farther than the AL5A accelerates less, so that its
+    hand does not. Raises :class:`InvalidSetting`.
+    """
     require_between("motion.velocity_scale", motion.velocity_scale, 0.01, 1.0)
     require_positive("motion.acceleration_deg_s2", motion.acceleration_deg_s2)
     velocities = np.array([arm.description.joint(name).velocity for name in ARM_JOINTS])
-    return motion.velocity_scale * velocities, np.full(len(ARM_JOINTS), math.radians(motion.acceleration_deg_s2))
+    acceleration_deg_s2 = min(1.0, REACH_MM / round(arm.reach_mm, 6)) * motion.acceleration_deg_s2
+    return motion.velocity_scale * velocities, np.full(len(ARM_JOINTS), math.radians(acceleration_deg_s2))
 
 
 def _still(q: Floats, from_mm: float, to_mm: float, duration_s: float, sample_s: float) -> tuple[Floats, Floats, Floats]:

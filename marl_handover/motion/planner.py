@@ -17,8 +17,9 @@ from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting, NotFinite, UnequalArms, WorkFailed
 from marl_handover.motion.collision_model import CollisionModel, Scene, ball_around, collision_models, standing_arm, standing_block
 from marl_handover.motion.home import parked_poses
-from marl_handover.motion.initial_guesses import SAMPLES, carrying_guesses, proportions, reaching_guesses
+from marl_handover.motion.initial_guesses import SAMPLES, carrying_guesses, reaching_guesses
 from marl_handover.motion.path_optimizer import FoundPath, Segment, find_path
+from marl_handover.motion.proportions import proportions
 from marl_handover.motion.trajectory import OutOfArmsReach, PickPlacePaths, TransferMotion
 from marl_handover.progress import working
 

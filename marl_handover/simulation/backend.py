@@ -59,6 +59,11 @@ class BulletBackend:
         self.last: RunReport | None = None
         """What happened in the last cycle that was carried out."""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was made up for physics, in words."""
+        return self.cell.notes
+
     def reset(self, pose: Floats, seed: int) -> Floats:
         """Park the arms and stand the object at ``pose`` (3,); its measured pose (3,). Nothing is random: ``seed`` changes nothing."""
         self.cell.reset(pose)

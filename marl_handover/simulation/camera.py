@@ -31,18 +31,19 @@ TOP = Camera((0.0, 0.0, 700.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 917.0)
 VIEWS = ("overview", "top")
 
 _OVERVIEW = Camera((-560.0, 0.0, 560.0), (-30.0, 0.0, 75.0), (0.0, 0.0, 1.0), 1330.0, height_px=832)
-_OVERVIEW_REACH_MM = 230.0
+_OVERVIEW_REACH_MM, _TOP_REACH_MM = 230.0, 320.0
 
 
 def view(name: str, cell: Cell) -> Camera:
     """The camera of that name, of :data:`VIEWS`: top, the cell's own; or overview.
 
-    The overview is for people: from the side, both arms and all that they reach in view, the left one on the left. It stands farther off
+    The overview is for people: from the side, both arms and all that they reach in view, the left one on the left. Both stand farther off
     where arms reach farther.
     """
+    reach_mm = max(arm.r_max_mm for arm in cell.arms)
     if name == "top":
-        return TOP
-    farther = max(1.0, cell.r_max_mm / _OVERVIEW_REACH_MM)
+        return TOP if reach_mm <= _TOP_REACH_MM else TOP._replace(eye_mm=(0.0, 0.0, reach_mm / _TOP_REACH_MM * TOP.eye_mm[2]))
+    farther = max(1.0, reach_mm / _OVERVIEW_REACH_MM)
     (eye_x, eye_y, eye_z), (x, y, z) = _OVERVIEW.eye_mm, _OVERVIEW.target_mm
     return _OVERVIEW._replace(eye_mm=(farther * eye_x, eye_y, farther * eye_z), target_mm=(farther * x, y, z))
 
@@ -56,6 +57,7 @@ def picture(engine: Engine, camera: Camera, width: int, height: int) -> Pixels:
     require_at_least("width", width, 1)
     require_at_least("height", height, 1)
     eye, target = ([length(value) for value in point] for point in (camera.eye_mm, camera.target_mm))
+    far_mm = max(_FAR_MM, 2 * float(np.linalg.norm(camera.eye_mm)))
     pixel = length(_NEAR_MM) / camera.focal_px * max(camera.width_px / width, camera.height_px / height)
     half_width, half_height = pixel * width / 2, pixel * height / 2
     _, _, pixels, _, _ = pybullet.getCameraImage(
@@ -63,7 +65,7 @@ def picture(engine: Engine, camera: Camera, width: int, height: int) -> Pixels:
         height,
         viewMatrix=pybullet.computeViewMatrix(eye, target, camera.up),
         projectionMatrix=pybullet.computeProjectionMatrix(
-            -half_width, half_width, -half_height, half_height, length(_NEAR_MM), length(_FAR_MM)
+            -half_width, half_width, -half_height, half_height, length(_NEAR_MM), length(far_mm)
         ),
         lightDirection=_LIGHT,
         shadow=0,

@@ -181,8 +181,12 @@ class Engine:
         """Disconnect; a second call does nothing."""
         self._connection()
 
-    def load_arm(self, path: Path, x_mm: float, y_mm: float, yaw_rad: float) -> int:
-        """A URDF with its base fixed to the table; gives the body's number. Raises :class:`UrdfError` for one that PyBullet cannot load."""
+    def load_arm(self, path: Path, x_mm: float, y_mm: float, yaw_rad: float, *, touches_itself: bool = True) -> int:
+        """A URDF with its base fixed to the table; gives the body's number. ``touches_itself``: whether its links stop each other.
+
+        Raises:
+            UrdfError: PyBullet cannot load it.
+        """
         try:
             body = pybullet.loadURDF(
                 str(path),
@@ -190,7 +194,7 @@ class Engine:
                 baseOrientation=pybullet.getQuaternionFromEuler([0.0, 0.0, yaw_rad]),
                 useFixedBase=True,
                 globalScaling=SCALE,
-                flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_SELF_COLLISION,
+                flags=pybullet.URDF_USE_INERTIA_FROM_FILE | (pybullet.URDF_USE_SELF_COLLISION if touches_itself else 0),
                 physicsClientId=self.client,
             )
         except pybullet.error as error:

@@ -44,10 +44,11 @@ def dress(cell: BulletCell) -> None:
 def _sector_mm(cell: Cell, arm: int) -> tuple[Floats, Floats]:
     """Inner and outer edge (n, 2) of an arm's annulus sector."""
     base = cell.bases[arm]
-    angle = base.facing_rad + np.linspace(*cell.yaw_rad, _STRIP)
+    ring = cell.arms[arm]
+    angle = base.facing_rad + np.linspace(*ring.yaw_rad, _STRIP)
     ray = np.stack([np.cos(angle), np.sin(angle)], -1)
     at = base.position_mm
-    return at + cell.r_min_mm * ray, at + cell.r_max_mm * ray
+    return at + ring.r_min_mm * ray, at + ring.r_max_mm * ray
 
 
 def _shared_mm(cell: Cell) -> tuple[Floats, Floats]:

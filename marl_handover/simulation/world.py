@@ -15,8 +15,10 @@ from marl_handover.cell.build import CellModel
 from marl_handover.config import BlockConfig, MotionConfig, require_choice
 from marl_handover.motion.home import parked_poses
 from marl_handover.motion.trajectory import Phase
-from marl_handover.simulation.arm import SERVO_S, SimulatedArm
+from marl_handover.simulation.arm import SERVO_S, SimulatedArm, grips_by_friction
+from marl_handover.simulation.arm_file import whole
 from marl_handover.simulation.camera import TOP, Camera, Pixels, picture
+from marl_handover.simulation.effort import require_effort
 from marl_handover.simulation.engine import COARSE, FINE, Engine, Floats, Surface, Touch, inertia, length, pybullet, tilt_of, to_mm
 
 _BEAD_SPACING_MM = 6.0
@@ -175,13 +177,17 @@ def _mass_properties(config: BlockConfig) -> tuple[float, float, tuple[float, fl
 
 
 GRASPS = ("friction", "constraint")
+"""How a pin is held: between two pads, or by a rigid joint. Hands without two sliding pads that have shapes always take the joint."""
+
+NEAR_MM = 4.0
+"""So near to the pin the grip of a hand without such pads has to be, for the block to stick to it."""
+
 CONTROL_S = 0.02
 """How often a run looks at contacts and calls back."""
 
 _CONTROL_STEPS = round(CONTROL_S / SERVO_S)
 _TABLE = Surface(lateral=0.3)  # paper on wood; below block half-width / pick height, so that a nudged block slides and does not tip
 _SETTLE_S = 0.2
-_STANDING_LINKS = 1  # the base and the turret stand on the table
 
 
 @dataclass
@@ -235,11 +241,16 @@ class BulletCell:
     Args:
         model: the cell.
         motion: where the arms park, and how far the fingers open.
-        grasp: "friction" (finger contact alone) or "constraint" (a rigid joint while both fingers are on the pin).
+        grasp: "friction" (finger contact alone) or "constraint" (a rigid joint while both fingers are on the pin). The block sticks to a
+            hand without two pads, or whose pads have no shapes, in either case, and passes through it otherwise.
         gui: open PyBullet's window.
+
+    Attributes:
+        notes: what was made up for physics, in words.
 
     Raises:
         UnknownChoice: for another ``grasp``.
+        UrdfError: an arm is too weak to hold itself up.
         NoWindow: if ``gui`` and there is no display.
     """
 
@@ -248,6 +259,9 @@ class BulletCell:
         model.cell.require_grip(motion.finger_travel_mm)
         self.model, self.motion, self.grasp = model, motion, grasp
         self.homes_rad = parked_poses(model, motion)
+        require_effort(model, motion, self.homes_rad)
+        self.notes = _notes(model)
+        self._sticky = [not grips_by_friction(arm.description) for arm in model.arms]
         self.engine = Engine(gui)
         self.reset((0.0, 0.0, 0.0))
 
@@ -264,9 +278,12 @@ class BulletCell:
     def reset(self, pose: ArrayLike) -> None:
         """Both arms parked with open fingers, the block standing at ``pose`` (3,): x_mm, y_mm, theta_rad; settled, at time 0."""
         self.engine.clear()
-        self._table = _table(self.engine)
+        self._table = _table(self.engine, max(1000.0, *(side + 200.0 for side in self.model.cell.extent_mm)))
         self.arms = [SimulatedArm(self.engine, arm, base) for arm, base in zip(self.model.arms, self.model.cell.bases, strict=True)]
         self.block = Block(self.engine, self.model.cell.config.block)
+        for arm, sticky in zip(self.arms, self._sticky, strict=True):
+            if sticky:
+                arm.pass_through(self.block.body, [-1])
         self._bonds: dict[int, int] = {}
         self._holding: set[int] = set()
         for arm, home_rad in zip(self.arms, self.homes_rad, strict=True):
@@ -296,7 +313,9 @@ class BulletCell:
         return self.block.tilt_rad()
 
     def held(self, arm: int) -> bool:
-        """Whether both fingers of ``arm`` press on the block or its pin."""
+        """Whether both fingers of ``arm`` press on the block or its pin; of a hand to which it sticks, whether it does."""
+        if self._sticky[arm]:
+            return arm in self._bonds or self._over_pin(arm)
         return all(
             any(touch.force_n > 0 for touch in self.engine.touches(self.arms[arm].body, self.block.body, finger))
             for finger in self.arms[arm].fingers
@@ -310,9 +329,7 @@ class BulletCell:
         holding = self._holding if holding is None else holding
         found: dict[str, Touch] = {}
         for index, arm in enumerate(self.arms):
-            self._note(
-                found, f"arm {index} - table", [t for t in self.engine.touches(arm.body, self._table) if t.first[1] >= _STANDING_LINKS]
-            )
+            self._note(found, f"arm {index} - table", [t for t in self.engine.touches(arm.body, self._table) if t.first[1] in arm.above])
             for other in range(index):
                 self._note(found, f"arm {other} - arm {index}", self.engine.touches(arm.body, self.arms[other].body))
             carrier = next((other for other in range(len(self.arms)) if other != index and other in holding), None)
@@ -363,13 +380,20 @@ class BulletCell:
             report.grasped = self.held(arm)
             if report.grasped:
                 self._holding.add(arm)
-                if self.grasp == "constraint":
+                if self.grasp == "constraint" or self._sticky[arm]:
                     self._bonds[arm] = self._bond(arm)
         elif step == track.opens_at:
             report.kept = self.held(arm)
             self._holding.discard(arm)
             if arm in self._bonds:
                 pybullet.removeConstraint(self._bonds.pop(arm), physicsClientId=self.engine.client)
+
+    def _over_pin(self, arm: int) -> bool:
+        """Whether the grip of an arm is at the pin."""
+        T, grip = self.block.transform(), self.arms[arm].grip_mm()
+        along, across = float((grip - T[:3, 3]) @ T[:3, 2]), np.cross(grip - T[:3, 3], T[:3, 2])
+        block = self.model.cell.config.block
+        return block.height_mm <= along <= block.pin_top_mm and float(np.linalg.norm(across)) <= NEAR_MM
 
     def _bond(self, arm: int) -> int:
         """A rigid joint between the hand and the block as they are now."""
@@ -407,8 +431,20 @@ class BulletCell:
             found[name] = min(real, key=lambda touch: touch.distance_mm)
 
 
-def _table(engine: Engine) -> int:
-    half, thick = length(1000.0), length(50.0)
+def _notes(model: CellModel) -> tuple[str, ...]:
+    """What is made up about the cell's robots, one line each."""
+    notes = {}
+    for arm in model.arms:
+        description = arm.description
+        made_up = list(whole(description).assumed[len(description.assumed) :])
+        if not grips_by_friction(description):
+            made_up.append("the block sticks to its hand: there are no two sliding pads with shapes")
+        notes[description.name] = f"physics of {description.name}: {'; '.join(made_up)}" if made_up else ""
+    return tuple(filter(None, notes.values()))
+
+
+def _table(engine: Engine, side_mm: float) -> int:
+    half, thick = length(side_mm), length(50.0)
     client = engine.client
     shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=[half, half, thick], physicsClientId=client)
     look = pybullet.createVisualShape(

@@ -22,6 +22,7 @@ from marl_handover.control.settings import twin_workcell
 from marl_handover.control.twin import Twin
 from marl_handover.errors import UnknownChoice
 from marl_handover.hardware.settings import ARMS
+from tests.canonical_arms import PARKED_DEG
 
 PHASES = [["approach", 0.0, 1.0], ["grasp", 1.0, 1.4], ["transfer", 1.4, 3.0], ["park", 3.0, 4.0]]
 
@@ -111,7 +112,7 @@ def test_no_block_is_pushed_from_under_a_hand_or_into_one(mishaps, twin, goal, m
     mishap = mishaps.arrange("nudge", 0.0, goal)
     twin.clock.sleep_s(0.5)
     assert not mishap.happened, "a hand beside it"
-    twin.electronics.put(1, np.radians(MotionConfig().parked_deg), twin.clock.now_s())
+    twin.electronics.put(1, np.radians(PARKED_DEG), twin.clock.now_s())
     twin.clock.sleep_s(0.5)
     assert mishap.happened
     assert math.dist(twin.true_pose()[:2], (105.0, 0.0)) < 20.5

@@ -29,7 +29,7 @@ def test_lengths_are_those_of_the_episodes_transfers(planner):
 def test_a_transfer_the_planner_refuses_has_no_length(planner):
     """The other arm does not park: it grasps where the second transfer is to end."""
     standing = copy(planner)
-    standing.home_rad = planner.grasp_joints(0, "hold", np.zeros(2))
+    standing.homes_rad = np.stack([planner.grasp_joints(0, "hold", np.zeros(2)), planner.homes_rad[1]])
     start, end = np.array([[200.0, -180.0]] * 2), np.array([[190.0, -100.0], [0.0, 0.0]])
     lengths, refused = motion_weight.planned_mm(standing, np.array([1, 1]), start, end)
     assert refused == 1

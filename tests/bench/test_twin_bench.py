@@ -18,8 +18,9 @@ from marl_handover.control.settings import twin_workcell
 from marl_handover.control.twin import Twin
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.estop import StopLatch
+from tests.canonical_arms import PARKED_DEG
 
-PARKED = np.radians(MotionConfig().parked_deg)
+PARKED = np.radians(PARKED_DEG)
 
 
 def row(number: int, **more: Any) -> dict[str, Any]:

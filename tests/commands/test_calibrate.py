@@ -11,7 +11,6 @@ import pytest
 
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.cli import main
-from marl_handover.config import MotionConfig
 from marl_handover.control.calibration import TerminalOperator, confirmed
 from marl_handover.control.settings import CardConfig, twin_workcell
 from marl_handover.errors import WorkFailed
@@ -20,6 +19,7 @@ from marl_handover.hardware.emulator.device import EmulatedCell
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.settings import ARMS
 from marl_handover.perception.calibration import CameraCalibration, hung_camera
+from tests.canonical_arms import PARKED_DEG
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def test_the_camera_maps_the_table_to_a_millimetre(twin_calibration):
 
 def test_servos_come_out_far_nearer_than_nominal_ones(twin_calibration, model):
     config = twin_workcell().hardware
-    truths = EmulatedCell(config, model.arm, np.radians(MotionConfig().parked_deg)).truths
+    truths = EmulatedCell(config, model.arm, np.radians(PARKED_DEG)).truths
     q = np.stack([model.arm.ik(np.array([radius, side, 45.0]))[0] for radius in (165, 190, 215) for side in (-60.0, 60.0)])
     for name in ARMS:
         found = load_calibration(twin_calibration / f"{name}.json", name, model.arm)

@@ -19,6 +19,7 @@ from marl_handover.motion.path_length_table import cache_file, path_length_table
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.task.episode import play
 from marl_handover.task.rules import Outcome, Rules
+from tests.canonical_arms import PARKED_DEG
 
 MOTION = MotionConfig()
 EXACT = NoiseConfig()
@@ -383,7 +384,7 @@ class Drooping(NoisyBackend):
 def at_limit(planner):
     """A planner whose parked pose has the wrist at its limit."""
     upper = math.degrees(planner.model.arm.upper_rad[3])
-    return MotionPlanner(planner.model, MotionConfig(parked_deg=[*MOTION.parked_deg[:3], upper, 0.0]))
+    return MotionPlanner(planner.model, MotionConfig(parked_deg=[*PARKED_DEG[:3], upper, 0.0]))
 
 
 @pytest.mark.parametrize(("joint", "off_rad"), [(3, 0.008), (4, 0.008), (4, -0.008)])

@@ -21,6 +21,7 @@ from interactive_fuzz import (
 from marl_handover.control.interactive.motion_program import FreePaths
 from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
 from marl_handover.motion.trajectory import NoPath
+from tests.canonical_arms import PARKED_DEG
 
 STORMS = [
     pytest.param(("exact", 50), id="exact"),
@@ -51,8 +52,8 @@ def test_joints_keep_their_limits_and_never_jump(fuzzed):
 
 
 def test_one_arm_moves_at_a_time_and_the_other_is_parked(fuzzed):
-    cell, seen = fuzzed
-    parked = np.radians(cell.motion.parked_deg)
+    _, seen = fuzzed
+    parked = np.radians(PARKED_DEG)
     for snapshot in seen.snapshots:
         away = [arm for arm, joints in enumerate(snapshot.joints_rad) if abs(joints - parked).max() > 1e-6]
         assert len(away) <= 1

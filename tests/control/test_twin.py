@@ -18,8 +18,9 @@ from marl_handover.hardware.errors import DeviceError
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.perception.detector import Detector
+from tests.canonical_arms import PARKED_DEG
 
-PARKED = np.radians(MotionConfig().parked_deg)
+PARKED = np.radians(PARKED_DEG)
 
 
 @pytest.fixture

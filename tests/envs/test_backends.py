@@ -23,9 +23,10 @@ from marl_handover.motion.pick_place import timed_phases
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import PickPlacePaths
 from marl_handover.task.rules import Command, Rules
+from tests.canonical_arms import PARKED_DEG
 
 MOTION = MotionConfig()
-PARKED = np.radians(MOTION.parked_deg)
+PARKED = np.radians(PARKED_DEG)
 START, PLACE_MM = np.array([120.0, 60.0, 0.7]), np.array([30.0, -20.0])  # both in reach of the left arm
 
 

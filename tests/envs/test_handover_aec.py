@@ -25,6 +25,7 @@ from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.policies import load
 from marl_handover.task.rules import Outcome, Rules
+from tests.canonical_arms import PARKED_DEG
 
 SUPERVISOR, LEFT, RIGHT = "supervisor", "arm_left", "arm_right"
 ARMS = (LEFT, RIGHT)
@@ -205,7 +206,7 @@ def test_the_named_arm_is_asked_and_sees_the_command(architecture, model, execut
     assert (seen["active"], other["active"], seen["final"]) == (1, 0, 0)
     np.testing.assert_allclose(seen["target"], [0.5 * model.cell.chart.x_max_mm, 0.0], rtol=1e-6)
     np.testing.assert_allclose(seen["object"], FAR["state"])
-    np.testing.assert_allclose(seen["joints"], np.radians(MotionConfig().parked_deg), rtol=1e-6)
+    np.testing.assert_allclose(seen["joints"], np.radians(PARKED_DEG), rtol=1e-6)
 
 
 def test_architecture_a_asks_the_finishing_arm_next(model, executors):
@@ -250,7 +251,7 @@ def test_an_executor_that_finds_no_path_says_so(model):
     """The other arm stands where the object is to go."""
     agent = ExecutorAgent("arm_left", model)
     pick, place, other = np.array([-200.0, 150.0]), np.array([0.0, 0.0]), model.arm.ik([180.0, 0.0, 45.0])[0]
-    seen = {"object": np.append(pick, 0.0), "target": place, "joints": np.radians(MotionConfig().parked_deg), "other_joints": other}
+    seen = {"object": np.append(pick, 0.0), "target": place, "joints": np.radians(PARKED_DEG), "other_joints": other}
     action = agent.act(seen)
     assert (action["grasp"], action["release"], action["reason"]) == (0, 0, 2)
     assert "short of the clearance to the other arm" in agent.last_refusal

@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from marl_handover.config import MotionConfig
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.emulator.device import EmulatedCell, parse_faults
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.settings import ArmWiring, BoardConfig, GripperConfig, HardwareConfig
 from marl_handover.motion.planner import MotionPlanner
+from tests.canonical_arms import PARKED_DEG
 
-PARKED = np.radians(MotionConfig().parked_deg)
+PARKED = np.radians(PARKED_DEG)
 
 
 @pytest.fixture(autouse=True)

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marl_handover.config import MotionConfig
 from marl_handover.geometry.capsules import ground_clearance_mm, self_clearance_mm
 from marl_handover.hardware.calibration import nominal_calibration
 from marl_handover.hardware.clearance import FAR_MM, arm_shapes, between_mm, still
 from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason, SafetyFilter
 from marl_handover.hardware.settings import ARMS, HardwareConfig
+from tests.canonical_arms import PARKED_DEG
 
-PARKED = np.radians(MotionConfig().parked_deg)
+PARKED = np.radians(PARKED_DEG)
 
 
 def made_gate(model, config=None):

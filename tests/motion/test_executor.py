@@ -12,9 +12,10 @@ from marl_handover.config import MotionConfig
 from marl_handover.errors import UnknownChoice
 from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
 from marl_handover.motion.trajectory import evaluate
+from tests.canonical_arms import PARKED_DEG
 
 MOTION = MotionConfig()
-PARKED = np.radians(MOTION.parked_deg)
+PARKED = np.radians(PARKED_DEG)
 
 
 @pytest.fixture(scope="module", params=["paper", "al5a"])

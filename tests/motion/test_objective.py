@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from marl_handover.cell.build import build_cell
-from marl_handover.config import MotionConfig
 from marl_handover.geometry.capsules import segment_distance
 from marl_handover.motion.initial_guesses import fit_control_points
 from marl_handover.motion.objective import Penalty, columns, first_moving, lagrangian, ramp
@@ -25,7 +24,7 @@ OTHER = np.array([0.3, 1.0, -2.2, 1.2, 0.0])
 def aside(tmp_path_factory):
     """The planner of two arms whose grips lie beside their planes, their hands pointing down."""
     cell = replace(SO101, lateral=-25.0).cell(tmp_path_factory.mktemp("aside"), grid_mm=10.0, base_distance_mm=360.0)
-    return MotionPlanner(build_cell(cell), MotionConfig(parked_deg=[0, 120, -150, 100, 0]))
+    return MotionPlanner(build_cell(cell))
 
 
 @pytest.fixture(params=["carrying", "reaching", "leaving", "carrying aside", "reaching aside"])

@@ -19,6 +19,7 @@ from marl_handover.motion import path_length_table as tables
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import adapted, load
 from marl_handover.task.rules import Rules, straight_line_mm
+from tests.canonical_arms import PARKED_DEG
 from tests.symmetries import GROUP
 
 MOTION = MotionConfig()
@@ -150,7 +151,7 @@ def test_the_key_follows_what_the_paths_depend_on(paper):
         (replace(paper, config=replace(config, pick_height_mm=50.0)), MOTION),
         (replace(paper, config=replace(config, block=replace(config.block, side_mm=41.0))), MOTION),
         (paper, replace(MOTION, lift_mm=41.0)),
-        (paper, replace(MOTION, parked_deg=[10.0, *MOTION.parked_deg[1:]])),
+        (paper, replace(MOTION, parked_deg=[10.0, *PARKED_DEG[1:]])),
     ]
     keys = [tables.settings_key(*settings) for settings in others]
     assert len({key, *keys}) == len(others) + 1

@@ -18,6 +18,7 @@ from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.pick_place import LIFTED_MM, timed_phases
 from marl_handover.motion.trajectory import PHASES, Phase, PickPlacePaths, basis
+from tests.canonical_arms import PARKED_DEG
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +43,7 @@ def cycle_paths(yaws_rad: tuple[float, float], radii_mm: tuple[float, float], li
     height = PICK_MM + lift_mm * np.sin(math.pi * part)
     grip = np.stack([radius * np.cos(yaw), radius * np.sin(yaw), height], axis=1)
     transfer = fit_control_points(ARM.ik(grip)[:, 0])
-    parked = np.radians(MOTION.parked_deg)
+    parked = np.radians(PARKED_DEG)
     way = np.linspace(0.0, 1.0, MOTION.control_points)[:, None]
     return PickPlacePaths(parked + way * (transfer[0] - parked), transfer, transfer[-1] + way * (parked - transfer[-1]))
 
@@ -94,7 +95,7 @@ def test_accelerations_are_within_their_limit_across_the_phases(yaws_rad: tuple[
 def test_ends_of_the_phases() -> None:
     phases = {phase.name: phase for phase in timed_phases(cycle_paths((-0.7, 0.6), (170.0, 190.0)), ARM, MOTION, PICK_MM)}
     assert tuple(phases) == PHASES
-    parked = np.radians(MOTION.parked_deg)
+    parked = np.radians(PARKED_DEG)
     np.testing.assert_array_equal(phases["approach"].joints_rad[0], parked)
     np.testing.assert_allclose(phases["retreat"].joints_rad[-1], parked, atol=1e-12)
     for name, yaw, radius in (("grasp", -0.7, 170.0), ("release", 0.6, 190.0)):

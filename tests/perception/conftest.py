@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from marl_handover.config import MotionConfig
 from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.calibration import CameraCalibration, calibrate_lens, hung_camera
 from marl_handover.perception.plane import BoardOnTable, locate_by_board
 from marl_handover.perception.printables import charuco_sheet
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.perception.settings import BoardConfig, LookConfig, MountConfig
+from tests.canonical_arms import PARKED_DEG
 
 SIZE_PX = (1280, 720)
 PLACES = ((-80.0, 0.0, math.pi / 2), (80.0, 10.0, -math.pi / 2))
@@ -33,7 +33,7 @@ def painter(model, truth):
 
 @pytest.fixture(scope="session")
 def parked(model):
-    return np.tile(np.radians(MotionConfig().parked_deg), (model.cell.num_arms, 1))
+    return np.tile(np.radians(PARKED_DEG), (model.cell.num_arms, 1))
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ from marl_handover.perception.detector import Detector
 from marl_handover.perception.printables import board_corners_mm
 from marl_handover.perception.scene import block_shapes, held_boards
 from marl_handover.simulation.world import BulletCell
+from tests.canonical_arms import PARKED_DEG
 
 
 def test_the_detector_sees_a_pybullet_cell_as_it_is(model, painter, calibration):
@@ -26,7 +27,7 @@ def test_an_arm_over_the_block_hides_it(model, painter, calibration):
     detector = Detector(calibration, model.cell.config.block)
     base, place = model.cell.bases[0], np.array([0.0, -10.0])
     above = model.arm.ik([base.y_mm - place[1] + 60.0, 0.0, 90.0])[0]
-    joints = np.stack([above, np.radians(MotionConfig().parked_deg)])
+    joints = np.stack([above, np.radians(PARKED_DEG)])
     assert detector.detect(painter.picture(flat_pose(*place, 0.3))).block is not None
     assert detector.detect(painter.picture(flat_pose(*place, 0.3), joints)).block is None
 

@@ -8,6 +8,7 @@ import pytest
 from marl_handover.config import MotionConfig
 from marl_handover.motion.trajectory import Phase
 from marl_handover.simulation.world import BulletCell
+from tests.canonical_arms import PARKED_DEG
 
 ABOVE_MM = 40.0
 SAMPLES = 60
@@ -46,7 +47,7 @@ def cycle(model, motion, joints_at):
     def make(arm, pick_mm, place_mm, turn_s=1.0):
         pick_mm, place_mm = np.asarray(pick_mm, float), np.asarray(place_mm, float)
         low = model.cell.pick_height_mm
-        parked, opened = np.radians(motion.parked_deg), motion.finger_travel_mm
+        parked, opened = np.radians(PARKED_DEG), motion.finger_travel_mm
         over = [joints_at(arm, place, low + ABOVE_MM)[0] for place in (pick_mm, place_mm)]
         down, up = (
             [joints_at(arm, np.tile(place, (SAMPLES, 1)), low + ABOVE_MM * height) for place in (pick_mm, place_mm)]

@@ -11,6 +11,7 @@ from marl_handover.motion.planner import MotionPlanner
 from marl_handover.simulation.backend import BulletBackend
 from marl_handover.simulation.engine import length, pybullet
 from marl_handover.simulation.world import CONTROL_S
+from tests.canonical_arms import PARKED_DEG
 
 
 @pytest.fixture
@@ -26,7 +27,7 @@ def planner(model, motion):
 
 
 def test_planned_transfers_succeed_one_after_the_other(backend, planner, motion, expected):
-    parked = np.radians(motion.parked_deg)
+    parked = np.radians(PARKED_DEG)
     pose = backend.reset(np.array([30.0, -15.0, 0.3]), 0)
     for arm, place in ((0, (-70.0, 10.0)), (1, (60.0, -30.0))):
         joints = backend.joints_rad()[arm] * (1, 1, 1, 1, 0)
@@ -42,7 +43,7 @@ def test_planned_transfers_succeed_one_after_the_other(backend, planner, motion,
 
 
 def test_senseless_cycles_are_refused_and_nothing_moves(backend, planner, motion):
-    parked = np.radians(motion.parked_deg)
+    parked = np.radians(PARKED_DEG)
     pose = backend.reset(np.array([30.0, -15.0, 0.3]), 0)
     paths = planner.pick_place(0, (40.0, -15.0), (-70.0, 10.0), parked, parked).paths
     assert backend.execute(0, paths).refusal == Refusal.OBJECT_ELSEWHERE
@@ -55,7 +56,7 @@ def test_a_missed_grasp_is_named_and_the_arm_parks(backend, cycle, motion):
     backend.reset(np.array([100.0, -120.0, 0.0]), 0)
     done = backend.carry_out(0, cycle(0, (-30.0, -25.0), (60.0, -10.0)))
     assert done.refusal == Refusal.MISSED_GRASP
-    np.testing.assert_allclose(done.joints_rad[0], np.radians(motion.parked_deg), atol=math.radians(0.2))
+    np.testing.assert_allclose(done.joints_rad[0], np.radians(PARKED_DEG), atol=math.radians(0.2))
 
 
 def test_a_block_let_go_on_the_way_is_dropped(backend, cycle):
@@ -71,7 +72,7 @@ def test_a_block_let_go_on_the_way_is_dropped(backend, cycle):
 
 def test_a_cycle_that_is_nearly_joined_is_carried_out(backend, planner, motion):
     """Within what the check lets pass; the timing takes no gap."""
-    parked = np.radians(motion.parked_deg)
+    parked = np.radians(PARKED_DEG)
     pose = backend.reset(np.array([30.0, -15.0, 0.3]), 0)
     paths = planner.pick_place(0, pose[:2], (-70.0, 10.0), parked, parked).paths
     for later in paths[1:]:

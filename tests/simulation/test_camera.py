@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from marl_handover.cell import build_cell, cell_config
-from marl_handover.config import MotionConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.report.motion import grip_mm
 from marl_handover.simulation.camera import TOP, view
+from tests.canonical_arms import PARKED_DEG
 
 
 def red_centre(image):
@@ -58,7 +58,7 @@ def test_the_overview_shows_all_that_arms_reach_and_the_parked_hands(name):
     for base in cell.bases:
         turned = base.facing_rad + angle
         points.append(np.stack([base.x_mm + radius * np.cos(turned), base.y_mm + radius * np.sin(turned), 0 * angle], -1))
-    parked = np.radians(MotionConfig().parked_deg)
+    parked = np.radians(PARKED_DEG)
     points += [grip_mm(model, arm, parked)[None] for arm in range(cell.num_arms)]
     away = np.concatenate(points) - camera.eye_mm
     forward = np.subtract(camera.target_mm, camera.eye_mm)

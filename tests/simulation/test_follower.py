@@ -9,6 +9,7 @@ from marl_handover.config import MotionConfig
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.simulation.follower import ServoFollower, ServoState
 from marl_handover.simulation.world import BulletCell
+from tests.canonical_arms import PARKED_DEG
 
 START = np.array([20.0, 10.0, 0.4])
 END_MM = np.array([-40.0, -15.0])
@@ -48,7 +49,7 @@ def test_the_block_goes_where_the_cell_itself_would_take_it(model, played):
 
 
 def test_a_world_at_rest_is_not_computed_until_somebody_moves(model):
-    parked = np.tile(np.radians(MotionConfig().parked_deg), (2, 1))
+    parked = np.tile(np.radians(PARKED_DEG), (2, 1))
     state = ServoState(parked, np.full(2, MotionConfig().finger_travel_mm))
     with BulletCell(model, MotionConfig()) as cell:
         cell.reset(START)

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from marl_handover.config import MotionConfig
 from marl_handover.errors import UnknownChoice
 from marl_handover.simulation.engine import NoWindow
 from marl_handover.simulation.world import BulletCell
+from tests.canonical_arms import PARKED_DEG
 
 CASES = [
     (0, (30.0, -15.0, 0.3), (-60.0, -5.0)),
@@ -34,7 +34,7 @@ def test_a_friction_grasp_puts_the_block_where_the_closed_form_says(cell, cycle,
     assert not report.collisions
     assert math.degrees(cell.tilt_rad()) < 0.5
     assert not cell.held(arm)
-    np.testing.assert_allclose(cell.joints_rad(), np.tile(np.radians(MotionConfig().parked_deg), (2, 1)), atol=math.radians(0.2))
+    np.testing.assert_allclose(cell.joints_rad(), np.tile(np.radians(PARKED_DEG), (2, 1)), atol=math.radians(0.2))
 
 
 def test_a_constraint_grasp_is_nearly_exact(model, motion, cycle, expected):
@@ -64,7 +64,7 @@ def test_equal_calls_give_bit_identical_states_whatever_went_before_and_beside(m
 def test_reset_stands_the_block_at_its_pose_and_parks_the_arms(cell, motion):
     cell.reset((40.0, 20.0, -2.5))
     np.testing.assert_allclose(cell.object_pose(), (40.0, 20.0, -2.5), atol=2e-3)
-    np.testing.assert_allclose(cell.joints_rad(), np.tile(np.radians(motion.parked_deg), (2, 1)), atol=1e-4)
+    np.testing.assert_allclose(cell.joints_rad(), np.tile(np.radians(PARKED_DEG), (2, 1)), atol=1e-4)
     assert cell.block.height_mm() == pytest.approx(0, abs=0.01)
     assert not cell.collisions()
     assert not any(cell.held(arm) for arm in range(2))

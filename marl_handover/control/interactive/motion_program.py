@@ -18,10 +18,11 @@ from marl_handover.control.interactive.world_state import MotionSegment, WorldSt
 from marl_handover.control.transfers import TransferCommand
 from marl_handover.errors import WorkFailed
 from marl_handover.motion.collision_model import ball_around, standing_block
-from marl_handover.motion.initial_guesses import SAMPLES, carrying_guesses, proportions, reaching_guesses
+from marl_handover.motion.initial_guesses import SAMPLES, carrying_guesses, reaching_guesses
 from marl_handover.motion.path_optimizer import FoundPath, Segment, find_path
 from marl_handover.motion.pick_place import motion_limits
 from marl_handover.motion.planner import STILL_MM, MotionPlanner, detour_length, string_length
+from marl_handover.motion.proportions import proportions
 from marl_handover.motion.time_parametrization import time_path
 from marl_handover.motion.trajectory import JointTrajectory, still
 
