@@ -82,7 +82,10 @@ def shaped_arm(arm: ClosedFormArm, config: RobotConfig) -> ClosedFormArm:
     limits, shaped = config.joint_limits_deg, with_shapes(arm, config.shapes)
     arm = arm if shaped is arm.description else ClosedFormArm(shaped, limits)
     ignored = touching_links(arm, MotionConfig())
-    return ClosedFormArm(replace(shaped, ignored=ignored), limits) if ignored else arm
+    if not ignored:
+        return arm
+    notes = tuple(f"links {one!r} and {other!r} touch in every posture, so that nobody keeps them apart" for one, other in ignored)
+    return ClosedFormArm(replace(shaped, ignored=ignored, assumed=(*shaped.assumed, *notes)), limits)
 
 
 def require_ring(arm: ClosedFormArm, config: RobotConfig) -> None:

@@ -114,6 +114,7 @@ def test_a_hand_in_the_block_reaches_nothing(tmp_path):
 def test_links_that_always_touch_are_ignored_and_listed(tmp_path, cells):
     shells = cell_with(SHELLS, tmp_path)
     assert shells.arm.description.ignored == (("base_link", "upper_arm"),)
+    assert any("'base_link' and 'upper_arm' touch" in note for note in shells.arm.description.assumed)
     assert all(cell.arm.description.ignored == () for cell in cells.values())
 
 
