@@ -120,7 +120,7 @@ def _text(summary: dict[str, Any], arm: ClosedFormArm, settings: RobotConfig) ->
     for index, (role, source) in enumerate(zip(ARM_JOINTS, arm.description.sources, strict=True)):
         low, high = math.degrees(arm.lower_rad[index]), math.degrees(arm.upper_rad[index])
         by = f"{low:.1f} to {high:.1f} deg by {summary['limits_from'][role]}"
-        way = f"{'along' if source.sign > 0 else 'against'} it, 0 at its {math.degrees(source.offset_rad) + 0.0:.4g}"
+        way = f"{'along' if source.sign > 0 else 'against'} it, 0 at its {round(math.degrees(source.offset_rad), 3) + 0.0:g}"
         rows.append((role, f"{joints[role]}: {by}, {way}" if source.joint else "none: held at 0"))
     rows += [("locked", f"{name} at {math.degrees(angle):.4g} deg") for name, angle in roles["locked"].items()]
     opens = f", each pad opens {gripper['travel_mm']:.3g} mm" if gripper["joints"] else "things stick to the tip"

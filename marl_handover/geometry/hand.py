@@ -20,6 +20,10 @@ _PAD_MM = 10.0
 _BESIDE_MM = 60.0
 """A frame farther from where the fingers meet is no grasp frame: cameras have frames, too."""
 _SMALL_MM = 1.0
+_NEAR_MM = 10.0
+"""The middle of fingers this near to the roll axis is on it: masses are not that exact."""
+_FINGER_MM = 50.0
+"""Of a hinged finger about which the file tells nothing."""
 
 
 @dataclass(frozen=True)
@@ -109,35 +113,30 @@ def _grip(
     if config.tip:
         return config.tip, frames[config.tip][:3, 3], []
     start = frames[roles.hand][:3, 3]
-    on_axis = len(roles.joints) == 5 and len(fingers) == 1 and fingers[0].kind != "prismatic"
+    along = {name: float(approach @ (frames[name][:3, 3] - start)) for name in skeleton.members[roles.hand]}
     if not fingers:
-        along = {name: float(approach @ (frames[name][:3, 3] - start)) for name in skeleton.members[roles.hand]}
         tip = max(along, key=lambda name: round(along[name], 6))
-        return (
-            tip,
-            frames[tip][:3, 3],
-            [f"tip: link {tip!r}, the farthest along the hand", "gripper: none; things stick to the tip"],
-        )
-    bases = [float(approach @ (frames[joint.child][:3, 3] - start)) for joint in fingers]
-    middle = (
-        start + approach * float(approach @ (_pads(skeleton, frames, fingers) - start)) if on_axis else _pads(skeleton, frames, fingers)
-    )
-    away = {name: frames[name][:3, 3] - middle for name in _leaves(skeleton, roles.hand)}
-    along = {name: float(approach @ (frames[name][:3, 3] - start)) for name in away}
-    ahead = [name for name in away if along[name] > max(bases) - _SMALL_MM and np.linalg.norm(_flat(away[name], approach)) < _BESIDE_MM]
+        notes = [f"tip: link {tip!r}, the farthest along the hand", "gripper: none; things stick to the tip"]
+        return tip, frames[tip][:3, 3], notes
+    bases = max(float(approach @ (frames[joint.child][:3, 3] - start)) for joint in fingers)
+    middle, rolls = _pads(skeleton, frames, fingers), len(roles.joints) == 5
+    one_jaw = rolls and len(fingers) == 1 and fingers[0].kind != "prismatic"
+    if one_jaw or (rolls and np.linalg.norm(_flat(middle - start, approach)) < _NEAR_MM):
+        middle = start + approach * float(approach @ (middle - start))
+    beside = {name: float(np.linalg.norm(_flat(frames[name][:3, 3] - middle, approach))) for name in _leaves(skeleton, roles.hand)}
+    ahead = [name for name in beside if along[name] > bases - _SMALL_MM and beside[name] < _BESIDE_MM]
     tip = max(ahead, key=lambda name: round(along[name], 6), default="")
-    if tip and not on_axis:
+    if tip and not one_jaw:
         return tip, frames[tip][:3, 3], [f"tip: link {tip!r}, a frame beyond the fingers' joints"]
     if tip:
-        return (
-            tip,
-            start + approach * along[tip],
-            [f"tip: on the roll axis, as far as link {tip!r}: there the jaw closes"],
-        )
+        notes = [f"tip: on the roll axis, as far as link {tip!r}: there the jaw closes"]
+        return tip, start + approach * along[tip], notes
     depth = max(_reach_mm(skeleton, frames, joint, approach) for joint in fingers)
-    grip = middle + approach * (max(bases) + depth - float(approach @ (middle - start)))
-    where = "on the roll axis" if on_axis else "midway between the fingers"
-    return "", grip, [f"tip: {where}, {depth:.0f} mm from the fingers' joints, guessed from their mass and shape; else set tip"]
+    if depth < _SMALL_MM and fingers[0].kind != "prismatic":
+        depth = _FINGER_MM
+    where = "on the roll axis" if one_jaw else "midway between the fingers"
+    notes = [f"tip: {where}, {depth:.0f} mm from the fingers' joints, guessed from their mass and shape; else set tip"]
+    return "", middle + approach * (bases + depth - float(approach @ (middle - start))), notes
 
 
 def _pads(skeleton: Skeleton, frames: Mapping[str, Floats], fingers: Sequence[Joint]) -> Floats:
@@ -159,8 +158,10 @@ def _reach_mm(skeleton: Skeleton, frames: Mapping[str, Floats], joint: Joint, ap
     for link in [joint.child, *(below.child for below in skeleton.below(joint.child))]:
         T = frames[link]
         middle_mm = float(approach @ (T[:3, :3] @ skeleton.centre(link)))
-        solid = bool(skeleton.links[link].collisions)
-        ahead_mm = middle_mm if solid else max(skeleton.far_end_mm(link) - _PAD_MM, middle_mm)
+        away_mm = float(np.linalg.norm(skeleton.centre(link)))
+        # Mass tells how far a finger reaches where it is ahead of the joint; else the joint's frame is at the finger's end.
+        tells = not skeleton.links[link].collisions and middle_mm > 0.5 * away_mm
+        ahead_mm = max(skeleton.far_end_mm(link) - _PAD_MM, middle_mm) if tells else middle_mm
         depths.append(float(approach @ (T[:3, 3] - start)) + ahead_mm)
     return max(depths)
 
@@ -178,58 +179,58 @@ def _gripper(
         return Gripper(), None, []
     sliding = fingers[0].kind == "prismatic"
     if len(fingers) > 2 and sliding:
-        raise UrdfError(
-            skeleton.tree.path, f"link {roles.hand!r} carries {len(fingers)} sliding fingers; name the two that grip with gripper"
-        )
-    leader = next((joint for joint in fingers if joint.mimic is None), fingers[0])
-    axis = skeleton.axis(leader, frames)
-    lever = float(approach @ (grip - frames[leader.child][:3, 3]))
-    moves = axis if sliding else np.cross(axis, approach)  # how its pad moves as its value grows
+        raise UrdfError(skeleton.tree.path, f"link {roles.hand!r} carries {len(fingers)} sliding fingers; name two with gripper")
+    fingers = sorted(fingers, key=lambda joint: joint.mimic is not None)
+    leader = fingers[0]
+    ways = [skeleton.axis(joint, frames) if sliding else np.cross(skeleton.axis(joint, frames), approach) for joint in fingers]
+    size = float(np.linalg.norm(ways[0]))
+    if size < 0.5:
+        return Gripper(), None, [f"gripper: none; joint {leader.name!r} turns about the way the hand points"]
     if sliding:
-        others = [_pad(skeleton, frames, joint) for joint in fingers if joint is not leader] or [grip]
-        outward = _pad(skeleton, frames, leader) - others[0]
+        outward = _pad(skeleton, frames, leader) - (_pad(skeleton, frames, fingers[1]) if len(fingers) > 1 else grip)
     else:
         outward = _flat(frames[leader.child][:3, 3] - grip, approach)
-    size = float(np.linalg.norm(moves))
-    if size < 0.5 or (not sliding and lever < _SMALL_MM):
-        raise UrdfError(
-            skeleton.tree.path, f"joint {leader.name!r} turns a finger about the way the hand points; name the gripper's joints"
-        )
-    side = float(moves @ outward)
+    side = float(ways[0] @ outward)
     notes = [] if abs(side) > 0.1 else [f"gripper: joint {leader.name!r} opens as its value grows"]
-    rates: list[float] = []
-    ends: list[float] = []
-    for joint in fingers:
-        other = skeleton.axis(joint, frames) if sliding else np.cross(skeleton.axis(joint, frames), approach)
-        if joint is leader:
-            rate = 1.0 if side > -0.1 else -1.0
-        elif joint.mimic is not None and joint.mimic.joint == leader.name:
-            rate = rates[0] * joint.mimic.multiplier
-        else:  # the other pad goes the other way
-            rate = -math.copysign(1.0, float(other @ moves)) * rates[0]
-        rates.append(rate)
-        ends.append(joint.lower if rate > 0 else joint.upper)
-    if fingers[0] is not leader:
-        raise UrdfError(
-            skeleton.tree.path, f"joint {fingers[0].name!r} mimics {leader.name!r}; name the gripper's joints, the leading one first"
-        )
-    return _record(skeleton, roles, fingers, rates, ends, lever, sliding), moves / size, notes
+    rates = [1.0 if side > -0.1 else -1.0]
+    for joint, way in zip(fingers[1:], ways[1:], strict=True):  # the other pad goes the other way, unless it is coupled
+        along = _coupling(skeleton, leader, joint)
+        rates.append(along[0] * rates[0] if along else -math.copysign(1.0, float(way @ ways[0])) * rates[0])
+    lever = max(float(approach @ (grip - frames[leader.child][:3, 3])), _SMALL_MM)
+    return _record(skeleton, roles, fingers, rates, 0.0 if sliding else lever), ways[0] / size, notes
 
 
-def _record(
-    skeleton: Skeleton, roles: Roles, fingers: Sequence[Joint], rates: Sequence[float], ends: Sequence[float], lever: float, sliding: bool
-) -> Gripper:
-    leader, pads = fingers[0], min(len(fingers), 2)
-    names, closed, opening = [joint.name for joint in fingers], list(ends), list(rates)
-    for joint in skeleton.below(roles.hand):  # of a linkage: bars that move along
-        if joint.mimic is not None and joint.mimic.joint == leader.name and joint.name not in names:
+def _coupling(skeleton: Skeleton, leader: Joint, joint: Joint) -> tuple[float, float] | None:
+    """(factor, offset) with which a joint follows the leader, or what the leader follows; None where it is free."""
+    (root, factor, offset), (other, own, shift) = (_followed(skeleton, each) for each in (leader, joint))
+    return (own / factor, shift - own / factor * offset) if root == other and factor else None
+
+
+def _followed(skeleton: Skeleton, joint: Joint) -> tuple[str, float, float]:
+    """The joint that another mimics in the end, with factor and offset; a free one: itself."""
+    if joint.mimic is None:
+        return joint.name, 1.0, 0.0
+    root, factor, offset = _followed(skeleton, skeleton.joints[joint.mimic.joint])
+    return root, joint.mimic.multiplier * factor, joint.mimic.multiplier * offset + joint.mimic.offset
+
+
+def _record(skeleton: Skeleton, roles: Roles, fingers: Sequence[Joint], rates: Sequence[float], lever: float) -> Gripper:
+    """The gripper of ``fingers``, the leading one first, and of the bars of a linkage that move along; ``lever``: 0 of sliding ones."""
+    leader = fingers[0]
+    shut = leader.lower if rates[0] > 0 else leader.upper
+    closed = [shut]
+    for joint, rate in zip(fingers[1:], rates[1:], strict=True):
+        along = _coupling(skeleton, leader, joint)
+        closed.append(along[0] * shut + along[1] if along else joint.lower if rate > 0 else joint.upper)
+    names, opening = [joint.name for joint in fingers], list(rates)
+    for joint in skeleton.below(roles.hand):
+        along = _coupling(skeleton, leader, joint)
+        if along and joint.name not in names:
             names.append(joint.name)
-            closed.append(joint.mimic.multiplier * ends[0] + joint.mimic.offset)
-            opening.append(joint.mimic.multiplier * rates[0])
-    for index, joint in enumerate(fingers):
-        if joint.mimic is not None:
-            closed[index] = joint.mimic.multiplier * ends[0] + joint.mimic.offset
-    way = min((joint.upper - joint.lower) / abs(rate) for joint, rate in zip(fingers, rates, strict=True) if joint.mimic is None and rate)
-    whole = way if sliding else 2 * lever * math.sin(min(way, math.pi / 2) / 2)
-    kind = "fingers" if sliding else "jaw"
-    return Gripper(kind, tuple(names), tuple(closed), tuple(opening), pads, 0.0 if sliding else lever, whole / (2 if pads == 1 else 1))
+            closed.append(along[0] * shut + along[1])
+            opening.append(along[0] * rates[0])
+    free = [joint for joint in fingers if joint is leader or not _coupling(skeleton, leader, joint)]
+    way = min(joint.upper - joint.lower for joint in free)
+    whole = 2 * lever * math.sin(min(way, math.pi / 2) / 2) if lever else way
+    pads = min(len(fingers), 2)
+    return Gripper("jaw" if lever else "fingers", tuple(names), tuple(closed), tuple(opening), pads, lever, whole / (2 if pads == 1 else 1))

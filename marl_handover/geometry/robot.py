@@ -97,7 +97,9 @@ def require_ring(arm: ClosedFormArm, config: RobotConfig) -> None:
         return
     asked = config.pitch_deg
     others = {pitch: arm.ring_mm(config.pick_height_mm, math.radians(pitch - asked)) for pitch in PITCHES_DEG}
-    wide = [pitch for pitch in sorted(others, key=lambda pitch: abs(pitch - asked)) if _width_mm(others[pitch]) >= LEAST_RING_MM]
+    widths = {pitch: _width_mm(ring) for pitch, ring in others.items()}
+    enough = max(LEAST_RING_MM, 0.5 * max(widths.values()))
+    wide = [pitch for pitch in sorted(others, key=lambda pitch: abs(pitch - asked)) if widths[pitch] >= enough]
     how = "level" if asked == 0 else f"at {asked:g} deg"
     fix = "change pick_height_mm"
     if wide and (ring := others[wide[0]]) is not None:

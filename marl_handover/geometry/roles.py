@@ -23,6 +23,7 @@ PARALLEL_RAD = 1e-3
 """Axes that differ by less are parallel: files round their angles."""
 MOST_LOCKS = 3
 _LEAST_LINK_MM = 1.0
+_BESIDE_MM = 5.0
 _ALONG = 0.5
 """What a roll carries is ahead of it: least cosine between its axis and the way there from the wrist."""
 
@@ -58,6 +59,8 @@ def find_roles(skeleton: Skeleton, config: RobotConfig) -> list[Roles]:
     for order, hand in enumerate(hands):
         grips = _grip_strength(skeleton, hand, config)
         for roles in _readings(skeleton, hand, config):
+            if roles.proposed and len(roles.joints) == 4 and not grips and not config.tip:
+                continue  # the last pitch would be a finger, or the like
             last = skeleton.path(hand)[-1].name
             turned = sum(abs(roles.locked[name]) for name in roles.proposed)
             key = (-(grips > 1), len(roles.proposed), -len(roles.joints), -grips, last in roles.locked, turned, order)
@@ -130,13 +133,27 @@ def finger_joints(skeleton: Skeleton, hand: str, config: RobotConfig) -> list[Jo
 
 
 def _is_jaw(skeleton: Skeleton, joint: Joint) -> bool:
-    """Whether a hinge moves a finger: what it carries is beside its axis, not on it, and moves nothing by itself."""
-    if joint.kind != "revolute" or any(below.mimic is None for below in skeleton.below(joint.child)):
+    """Whether a hinge moves a finger: another mimics it, or what it carries is beside its axis, not on it, and moves nothing by itself."""
+    if joint.kind == "prismatic" or any(below.mimic is None for below in skeleton.below(joint.child)):
         return False
+    if joint.mimic is not None or any(other.mimic is not None and other.mimic.joint == joint.name for other in skeleton.above.values()):
+        return True
     frames = skeleton.frames({})
     axis, way = skeleton.axis(joint, frames), hand_point(skeleton, joint.child, frames) - frames[joint.child][:3, 3]
-    along = abs(float(axis @ way))
-    return bool(np.linalg.norm(way) < _LEAST_LINK_MM or np.linalg.norm(way - axis * float(axis @ way)) > along)
+    if np.linalg.norm(way) < _LEAST_LINK_MM:  # nothing is known of it: hinges of fingers are beside the axis before them
+        before = skeleton.path(skeleton.body[joint.parent])
+        return joint.kind == "revolute" and bool(before) and _apart_mm(skeleton, joint, before[-1], frames) > _BESIDE_MM
+    return bool(np.linalg.norm(way - axis * float(axis @ way)) > abs(float(axis @ way)))
+
+
+def _apart_mm(skeleton: Skeleton, one: Joint, other: Joint, frames: Mapping[str, Floats]) -> float:
+    """Distance between the axes of two joints."""
+    axes = [skeleton.axis(joint, frames) for joint in (one, other)]
+    gap = frames[one.child][:3, 3] - frames[other.child][:3, 3]
+    across = np.cross(axes[0], axes[1])
+    if np.linalg.norm(across) < PARALLEL_RAD:
+        return float(np.linalg.norm(gap - axes[0] * float(gap @ axes[0])))
+    return abs(float(gap @ across)) / float(np.linalg.norm(across))
 
 
 def _grip_strength(skeleton: Skeleton, hand: str, config: RobotConfig) -> int:

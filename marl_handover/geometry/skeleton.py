@@ -9,7 +9,7 @@ import numpy as np
 
 from marl_handover.arrays import Floats
 from marl_handover.geometry.se3 import rotation, transform
-from marl_handover.geometry.urdf import Joint, UrdfTree
+from marl_handover.geometry.urdf import Joint, Primitive, UrdfTree
 
 
 class Skeleton:
@@ -81,11 +81,12 @@ class Skeleton:
         return np.asarray(frames[joint.child][:3, :3] @ np.asarray(joint.axis))
 
     def centre(self, link: str) -> Floats:
-        """Where a link's bulk is, (3,) mm in its frame: its centre of mass, the middle of its shapes, or its origin."""
+        """Where a link's bulk is, (3,) mm in its frame: its centre of mass, the middle of its shapes, or, of meshes alone, its origin."""
         about = self.links[link]
         if about.inertial is not None and about.inertial.mass_kg > 0 and any(about.inertial.xyz_mm):
             return np.asarray(about.inertial.xyz_mm)
-        shapes = [shape.xyz_mm for shape in about.collisions] or [visual.shape.xyz_mm for visual in about.visuals]
+        seen = [visual.shape for visual in about.visuals if isinstance(visual.shape, Primitive)]
+        shapes = [shape.xyz_mm for shape in about.collisions or seen]
         return np.mean(shapes, axis=0) if shapes else np.zeros(3)
 
     def far_end_mm(self, link: str) -> float:

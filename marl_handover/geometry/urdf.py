@@ -274,9 +274,8 @@ def _parse(path: Path) -> ET.Element:
     if robot.tag != "robot":
         _fail(path, f"its outermost element is <{robot.tag[:40]}>; it must be <robot>" + _hint(_OTHER_FORMATS.get(robot.tag, "")))
     parts = [part for tag in ("link", "joint") for part in robot.findall(tag)]
-    if any("xacro" in each.tag for each in robot.iter()) or any(
-        "${" in value for part in parts for each in part.iter() for value in each.attrib.values()
-    ):
+    commands = any("xacro" in each.tag and not each.tag.endswith("property") for each in robot.iter())
+    if commands or any("${" in value for part in parts for each in part.iter() for value in each.attrib.values()):
         _fail(path, xacro)
     return robot
 

@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from marl_handover.config import RobotConfig
 from marl_handover.errors import InvalidSetting, UnknownChoice, UnsupportedKinematics, UrdfError
 from marl_handover.files import resource_path
+from marl_handover.geometry.canonical import require_moving
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.robot import describe, robot_config
 from marl_handover.geometry.se3 import rotation, rpy_of, transform
-from marl_handover.geometry.urdf import ARM_JOINTS
+from marl_handover.geometry.urdf import ARM_JOINTS, Gripper
 
 SHIPPED = resource_path("urdf/al5a.urdf")
 TEXT = SHIPPED.read_text()
@@ -261,3 +262,81 @@ def test_one_convention_more_is_the_same_arm(name: str) -> None:
         assert arm.ring_mm(45.0) == pytest.approx(base.ring_mm(45.0), abs=beside)
     kinds = {"jaw": "jaw", "no_fingers": "none", "upright_zero": "none"}
     assert arm.description.gripper.kind == kinds.get(name, "fingers")
+
+
+SIX_AXES = [  # joint, origin xyz, rpy: three parallel pitches, then two joints that turn a flange
+    ("j1", "0 0 0.13", "0 0 0"),
+    ("j2", "0 0 0", "0 1.5707963 -1.5707963"),
+    ("j3", "-0.11 0 0", "0 0 0"),
+    ("j4", "-0.096 0 0.064", "0 0 -1.5707963"),
+    ("j5", "0 -0.073 0", "1.5707963 -1.5707963 0"),
+    ("j6", "0 0.045 0", "-1.5707963 0 0"),
+]
+
+
+def six_axes() -> str:
+    links = "".join(
+        f'<link name="l{index}"><visual><geometry><mesh filename="package://x/{index}.dae"/></geometry></visual></link>'
+        for index in range(7)
+    )
+    joints = "".join(
+        f'<joint name="{name}" type="revolute"><parent link="l{index}"/><child link="l{index + 1}"/><origin xyz="{xyz}" rpy="{rpy}"/>'
+        '<axis xyz="0 0 1"/><limit effort="1000.0" lower="-3.14" upper="3.14159" velocity="0"/></joint>'
+        for index, (name, xyz, rpy) in enumerate(SIX_AXES)
+    )
+    head = '<robot name="six" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:property name="unused" value=".2"/>'
+    return f"{head}{links}{joints}</robot>"
+
+
+def test_six_axes_without_masses_shapes_or_speed_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "six.urdf"
+    path.write_text(six_axes())
+    description = describe(RobotConfig(urdf=str(path)))
+    assert [source.joint for source in description.sources] == ["j1", "j2", "j3", "j4", "j6"]
+    assert description.locked == (("j5", 0.0),)
+    require_moving(description, RobotConfig(), needs_speed=False)
+    with pytest.raises(UrdfError, match="joint 'j1' has velocity 0"):
+        require_moving(description, RobotConfig())
+
+
+def test_a_finger_is_no_wrist_pitch(tmp_path: Path) -> None:
+    """Yaw, two pitches and a roll with a hinged finger, which would be parallel to the pitches if the roll were locked."""
+    robot = ET.fromstring(missing("wrist_pitch"))
+    for joint in list(robot.findall("joint")):
+        if joint.get("name") == "finger_right":
+            robot.remove(joint)
+        elif joint.get("name") == "finger_left":
+            joint.set("type", "revolute")
+            joint.find("axis").set("xyz", "0 0 1")  # type: ignore[union-attr]
+    path = tmp_path / "jaw.urdf"
+    path.write_text(ET.tostring(robot, encoding="unicode"))
+    with pytest.raises(UnsupportedKinematics, match="no wrist pitch"):
+        read(path)
+
+
+@pytest.mark.parametrize("factor", [1.0, -1.0])
+def test_fingers_that_mimic_each_other_or_a_third_open_as_the_free_ones_do(tmp_path: Path, factor: float) -> None:
+    text = TEXT
+    if factor < 0:
+        text = text.replace(
+            '<axis xyz="0 -1 0"/>\n    <limit lower="0" upper="0.016"', '<axis xyz="0 1 0"/>\n    <limit lower="-0.016" upper="0"'
+        )
+    mimicking = text.replace(
+        'velocity="0.095"/>\n  </joint>\n\n  <joint name="grasp"',
+        f'velocity="0.095"/><mimic joint="finger_left" multiplier="{factor}"/>\n  </joint>\n\n  <joint name="grasp"',
+    )
+    assert mimicking.count("<mimic") == 1
+    path = tmp_path / "mimic.urdf"
+    path.write_text(mimicking)
+    values = describe(RobotConfig(urdf=str(path))).gripper.joint_values(10.0)
+    assert values == pytest.approx({"finger_left": 10.0, "finger_right": 10.0 * factor})
+
+
+def test_the_gripper_knows_how_far_it_is_open() -> None:
+    jaw = Gripper("jaw", ("hinge",), (-0.2,), (1.0,), pads=1, lever_mm=70.0, travel_mm=40.0)
+    for kind in (jaw, describe(robot_config("al5a")).gripper):
+        for opening_mm in (0.0, 3.0, 12.0):
+            values = kind.joint_values(opening_mm)
+            assert kind.gripper_mm([values[name] for name in kind.joints]) == pytest.approx(opening_mm)
+    assert jaw.joint_values(5.0)["hinge"] == pytest.approx(-0.2 + 2 * math.asin(10.0 / 140.0))
+    assert Gripper().joint_values(5.0) == {}
