@@ -1,11 +1,11 @@
-"""Many items of work over the cores of this machine or of a Ray cluster, through joblib.
+"""Many items of work over the cores of this machine, through joblib, or of a Ray cluster.
 
 What an item does may fail, and so may the process that does it. An exception becomes a :class:`Failure` in the place of that item's
 result; a worker that dies takes only unfinished items with it, and those are started again, from nothing: a function that can continue
 half-way (a training run from its checkpoint) has to see to that by itself.
 
-joblib's own Ray backend (``ray.util.joblib``) is of no use for that: it hands over no results as they come, deals the items out to actors
-that nobody replaces, and ends the call at the first one that dies. Here an item is a Ray task, which fails alone and is given to Ray again.
+joblib's Ray backend (``ray.util.joblib``) is of no use for that: it hands over no results as they come, deals the items out to actors that
+nobody replaces, and ends the call at the first one that dies. Here an item is a Ray task, which fails alone and is given to Ray again.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import threading
 import time
 import traceback
 import warnings
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
@@ -35,8 +35,13 @@ from marl_handover.config import require_at_least, require_choice
 from marl_handover.plugins import Parcel
 from marl_handover.progress import Bar
 
+LOG = logging.getLogger(__name__)
+
 WATCH_S = 1.0
 """How often a worker looks whether the process that started it is still there."""
+
+CANCEL_S = 10.0
+"""So long it is waited for tasks on a cluster that were cancelled to end."""
 
 
 @dataclass(frozen=True)
@@ -63,17 +68,6 @@ def summary(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno}, in {frames[-1].name})" if frames else ""
     return " ".join(f"{type(error).__name__}: {error}{place}".split())
-
-
-def run_parallel(backend: ParallelBackendBase, parcels: Mapping[int, Parcel], workers: int, at_once: int) -> Generator[Outcome, None, None]:
-    """One joblib call: the outcome of each parcel as it is done, ``at_once`` of them at the same time."""
-    parallel = Parallel(n_jobs=workers, backend=backend, batch_size=1, pre_dispatch=at_once, return_as="generator_unordered")
-    with warnings.catch_warnings():
-        # A call that is closed early warns of the work it throws away; that is what closing is for.
-        warnings.filterwarnings("ignore", message=".*still being processed by the workers.*")
-        warnings.filterwarnings("ignore", message=".*successfully executed +but not used.*")
-        with closing(parallel(delayed(attempt)(index, parcel) for index, parcel in list(parcels.items()))) as outcomes:
-            yield from outcomes
 
 
 def died(index: int, attempts: int, reason: str = "") -> Outcome:
@@ -130,13 +124,10 @@ def _watch(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-LOG = logging.getLogger(__name__)
-
-
-def through_ray(
-    parcels: Mapping[int, Parcel], names: list[str], address: str, jobs: int, attempts: int, ready: Callable[[], None]
+def _through_ray(
+    parcels: list[Parcel], names: list[str], address: str, jobs: int, attempts: int, ready: Callable[[], None]
 ) -> Generator[Outcome, None, None]:
-    """The outcome of each parcel as it is done, on the cluster at ``address``; see :func:`marl_handover.experiments.executor.fan_out`."""
+    """The outcome of each parcel as it is done, on the cluster at ``address``: a task on one core, given to Ray again if it dies."""
     if not parcels:
         return
     with connected(require_ray("launcher=ray"), address, jobs) as ray:
@@ -144,93 +135,48 @@ def through_ray(
         if not cores:
             raise ClusterUnavailable(address, "it has no cores")
         ready()
-        backend = RayTasks(ray, names, attempts)
-        at_once = jobs or cores
-        # With a single worker joblib would do the work in this process.
-        with closing(run_parallel(backend, parcels, max(2, at_once), at_once)) as outcomes:
-            yield from outcomes
-
-
-class RayTasks(ParallelBackendBase):
-    """Every submitted call becomes a Ray task on one core. A thread for each of them waits for it, and gives it to Ray again if it dies.
-
-    Args:
-        ray: the module, connected to a cluster.
-        names: of the items, for messages.
-        attempts: how often an item is started at most.
-    """
-
-    supports_retrieve_callback = True
-
-    def __init__(self, ray: Any, names: list[str], attempts: int) -> None:
-        super().__init__(nesting_level=0)
-        self._ray, self._names, self._attempts = ray, names, attempts
-        one_thread = {name: "1" for name in self.MAX_NUM_THREADS_VARS}
+        one_thread = {name: "1" for name in ParallelBackendBase.MAX_NUM_THREADS_VARS}
         # Ray's own retries stay off: it repeats a task that runs out of memory without end.
-        self._task = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": one_thread})(_call)
-        self._running: set[Any] = set()
-        self._threads: ThreadPoolExecutor | None = None
-        self._aborted = False
+        task = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": one_thread})(attempt)
+        running: dict[Any, int] = {}
+        waiting, tried = deque(range(len(parcels))), Counter[int]()
 
-    def effective_n_jobs(self, n_jobs: int) -> int:
-        """As asked: the caller knows the cluster."""
-        return n_jobs
+        def start() -> None:
+            """Keep Ray supplied; unless ``jobs`` are asked for, it knows best how many run at once."""
+            while waiting and len(running) < (jobs or len(parcels)):
+                index = waiting.popleft()
+                tried[index] += 1
+                running[task.remote(index, parcels[index])] = index
 
-    def configure(self, n_jobs: int = 1, parallel: Any = None, **_: Any) -> int:
-        """As the base class."""
-        self.parallel, self._threads = parallel, ThreadPoolExecutor(n_jobs, thread_name_prefix="ray-task")
-        return n_jobs
-
-    def submit(self, func: Any, callback: Any = None) -> Future[list[Outcome]]:
-        """As the base class."""
-        assert self._threads is not None
-        future = self._threads.submit(self._until_done, func)
-        if callback is not None:
-            future.add_done_callback(callback)
-        return future
-
-    def retrieve_result_callback(self, out: Future[list[Outcome]]) -> list[Outcome]:
-        """As the base class."""
-        return out.result()
-
-    def abort_everything(self, ensure_ready: bool = True) -> None:
-        """Kill the tasks that run; the backend is of no use after that."""
-        self._aborted = True
-        for reference in list(self._running):
-            self._ray.cancel(reference, force=True)
-
-    def terminate(self) -> None:
-        """As the base class."""
-        if self._threads is not None:
-            self._threads.shutdown(wait=self._aborted, cancel_futures=True)
-
-    def _until_done(self, batch: Any) -> list[Outcome]:
-        _, (index, _), _ = batch.items[0]
-        error: Exception | None = None
-        for number in range(1, self._attempts + 1):
-            if error is not None:
-                reason = type(error).__name__
-                LOG.warning("%s: a worker died (%s); starting it again (%d of %d)", self._names[index], reason, number, self._attempts)
-            reference = self._task.remote(batch)
-            self._running.add(reference)
-            try:
-                outcomes: list[Outcome] = self._ray.get(reference)
-                return outcomes
-            except self._ray.exceptions.RayTaskError as unusable:
-                return [Outcome(index, None, summary(unusable.cause or unusable), str(unusable))]
-            except self._ray.exceptions.RayError as death:
-                error = death
-                if self._aborted:
-                    break
-            finally:
-                self._running.discard(reference)
-        return [died(index, self._attempts, type(error).__name__)]
+        try:
+            start()
+            while running:
+                (done,), _ = ray.wait(list(running), num_returns=1)
+                outcome = _outcome(ray, done, running.pop(done))
+                if outcome.worker_died and tried[outcome.index] < attempts:
+                    again = f"starting it again ({tried[outcome.index] + 1} of {attempts})"
+                    LOG.warning("%s: a worker died (%s); %s", names[outcome.index], outcome.error, again)
+                    waiting.appendleft(outcome.index)
+                    start()
+                    continue
+                start()
+                yield died(outcome.index, attempts, outcome.error) if outcome.worker_died else outcome
+        finally:
+            for reference in running:
+                ray.cancel(reference, force=True)
+            if running:
+                ray.wait(list(running), num_returns=len(running), timeout=CANCEL_S)
 
 
-def _call(batch: Any) -> list[Outcome]:
-    """What a task does."""
-    outcomes: list[Outcome] = batch()
-    return outcomes
+def _outcome(ray: Any, reference: Any, index: int) -> Outcome:
+    """What a task that has ended brought; of one that died, the kind of death is the error."""
+    try:
+        outcome: Outcome = ray.get(reference)
+        return outcome
+    except ray.exceptions.RayTaskError as unusable:
+        return Outcome(index, None, summary(unusable.cause or unusable), str(unusable))
+    except ray.exceptions.RayError as death:
+        return Outcome(index, None, type(death).__name__, worker_died=True)
 
 
 LAUNCHERS = ("loky", "ray")
@@ -298,7 +244,7 @@ def fan_out(
     parcels = [Parcel(partial(function, item)) for item in items]
     names = [label(item) for item in items]
     if launcher == "ray":
-        outcomes = through_ray(dict(enumerate(parcels)), names, address, jobs, attempts, ready)
+        outcomes = _through_ray(parcels, names, address, jobs, attempts, ready)
     else:
         outcomes = _through_loky(parcels, names, jobs or cpu_count(), attempts, ready)
     return _delivered(items, names, outcomes, progress)
@@ -346,12 +292,19 @@ def _through_loky(
 
 
 def _round(backend: LokyWorkers, parcels: Mapping[int, Parcel], workers: int, alone: bool) -> Generator[Outcome, None, None]:
-    """Outcomes until all are there or a worker dies."""
+    """Outcomes until all are there or a worker dies. With a single worker joblib would do the work in this process."""
+    jobs, at_once = (max(2, workers), 1) if alone else (workers, workers)
+    parallel = Parallel(n_jobs=jobs, backend=backend, batch_size=1, pre_dispatch=at_once, return_as="generator_unordered")
     delivered = set()
-    try:
-        for outcome in run_parallel(backend, parcels, max(2, workers) if alone else workers, at_once=1 if alone else workers):
-            delivered.add(outcome.index)
-            yield outcome
-    except BrokenProcessPool:
-        # What was done before the death, but not yet handed over, joblib drops.
-        yield from (outcome for index, outcome in backend.finished.items() if index not in delivered)
+    with warnings.catch_warnings():
+        # A call that is closed early warns of the work it throws away; that is what closing is for.
+        warnings.filterwarnings("ignore", message=".*still being processed by the workers.*")
+        warnings.filterwarnings("ignore", message=".*successfully executed +but not used.*")
+        try:
+            with closing(parallel(delayed(attempt)(index, parcel) for index, parcel in list(parcels.items()))) as outcomes:
+                for outcome in outcomes:
+                    delivered.add(outcome.index)
+                    yield outcome
+        except BrokenProcessPool:
+            # What was done before the death, but not yet handed over, joblib drops.
+            yield from (outcome for index, outcome in backend.finished.items() if index not in delivered)

@@ -10,7 +10,8 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -192,11 +193,7 @@ def load_calibration(path: Path | str, arm: str, model: ArmModel) -> ArmCalibrat
     path = Path(path)
     if not path.is_file():
         raise MissingFile("servo calibration", path, "run: marl-handover calibrate")
-    try:
-        content = read_json(path, "servo calibration")
-        version = content["version"]
-        if version != VERSION:
-            raise CorruptFile("servo calibration", path, f"it has version {version!r}, this program reads {VERSION}")
+    with _stored("servo calibration", path, VERSION) as content:
         owner = (content["arm"], content["robot"])
         limits = {name: tuple(float(value) for value in pair) for name, pair in content["limits_rad"].items()}
         points = {
@@ -204,8 +201,6 @@ def load_calibration(path: Path | str, arm: str, model: ArmModel) -> ArmCalibrat
             for name, entry in content["joints"].items()
         }
         measured = float(content["measured_unix_s"])
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise CorruptFile("servo calibration", path, f"{type(error).__name__}: {error}") from error
     if owner != (arm, model.description.name):
         raise CalibrationProblem(str(path), f"it is of arm {owner[0]!r}, robot {owner[1]!r}; wanted {arm!r}, {model.description.name!r}")
     _require_joints(arm, points)
@@ -216,6 +211,18 @@ def load_calibration(path: Path | str, arm: str, model: ArmModel) -> ArmCalibrat
             raise CalibrationProblem(str(path), f"{joint} was calibrated with limits {then} degrees, the URDF has {now}: calibrate again")
     maps = tuple(ServoMap(f"{arm} {joint}", points[joint][1], points[joint][0]) for joint in ARM_JOINTS)
     return ArmCalibration(arm, model.description.name, maps, _limits(model), measured)
+
+
+@contextmanager
+def _stored(what: str, path: Path, version: int, again: str = "") -> Iterator[dict[str, Any]]:
+    """What a file of that version holds. Raises :class:`CorruptFile` for another one, and for whatever is missed in it within the block."""
+    try:
+        content = read_json(path, what)
+        if content["version"] != version:
+            raise CorruptFile(what, path, f"it has version {content['version']!r}, this program reads {version}{again}")
+        yield content
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise CorruptFile(what, path, f"{type(error).__name__}: {error}") from error
 
 
 def calibrations(config: HardwareConfig, model: ArmModel) -> tuple[ArmCalibration, ...]:
@@ -268,17 +275,11 @@ def load_backlash(folder: Path) -> dict[str, Floats]:
     path = folder / BACKLASH_FILE
     if not path.is_file():
         raise MissingFile("backlash of the servos", path, _SERVOS_AGAIN)
-    try:
-        content = read_json(path, "backlash of the servos")
-        if content["version"] != BACKLASH_VERSION:
-            why = f"it has version {content['version']!r}, this program reads {BACKLASH_VERSION}, a band for each joint"
-            raise CorruptFile("backlash of the servos", path, f"{why}; {_SERVOS_AGAIN}")
+    with _stored("backlash of the servos", path, BACKLASH_VERSION, f", a band for each joint; {_SERVOS_AGAIN}") as content:
         found = {arm: np.array([float(content["half_band_us"][arm][joint]) for joint in ARM_JOINTS]) for arm in ARMS}
         for arm, values in found.items():
             for joint, value in zip(ARM_JOINTS, values, strict=True):
                 require_between(f"half_band_us.{arm}.{joint}", float(value), 0.0, MOST_US)
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise CorruptFile("backlash of the servos", path, f"{type(error).__name__}: {error}") from error
     return found
 
 
@@ -323,16 +324,9 @@ def require_one_set(folder: Path, names: Collection[str] = SERVO_FILES) -> None:
         if not (folder / name).is_file():
             raise MissingFile("servo calibration", folder / name, _SERVOS_AGAIN)
     path = folder / SET_FILE
-    try:
-        content = read_json(path, "servo calibration")
-        if content["version"] != _SET_VERSION:
-            raise CorruptFile(
-                "servo calibration", path, f"it has version {content['version']!r}, this program reads {_SET_VERSION}; {_SERVOS_AGAIN}"
-            )
+    with _stored("servo calibration", path, _SET_VERSION, f"; {_SERVOS_AGAIN}") as content:
         wanted = {name: str(content["sha256"][name]) for name in names}
         others = [name for name in names if _digest(folder / name) != wanted[name]]
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise CorruptFile("servo calibration", path, f"{type(error).__name__}: {error}") from error
     if others:
         raise CalibrationProblem(str(folder), f"{' and '.join(others)} changed since the others were written; {_SERVOS_AGAIN}")
 
@@ -378,18 +372,9 @@ def with_grippers(hardware: HardwareConfig, folder: Path) -> HardwareConfig:
     path = folder / GRIPPERS_FILE
     if not path.is_file():
         return hardware
-    try:
-        content = read_json(path, "gripper calibration")
-        if content["version"] != _GRIPPERS_VERSION:
-            raise CorruptFile(
-                "gripper calibration",
-                path,
-                f"it has version {content['version']!r}, this program reads {_GRIPPERS_VERSION}; {_GRIPPERS_AGAIN}",
-            )
+    with _stored("gripper calibration", path, _GRIPPERS_VERSION, f"; {_GRIPPERS_AGAIN}") as content:
         asked = {arm: {name: float(content["arms"][arm]["settings"][name]) for name in _GRIPPERS_ASKED} for arm in ARMS}
         found = {arm: {name: int(content["arms"][arm]["found"][name]) for name in _GRIPPERS_FOUND} for arm in ARMS}
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise CorruptFile("gripper calibration", path, f"{type(error).__name__}: {error}") from error
     for arm in ARMS:
         now = _picked(hardware.arms[arm].gripper, _GRIPPERS_ASKED)
         if now != asked[arm]:
