@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -19,11 +20,14 @@ from marl_handover.errors import InvalidSetting, NoSharedSpace, UnequalArms
 from marl_handover.files import expanded, resource_path
 from marl_handover.geometry.capsules import base_radius_mm
 from marl_handover.geometry.closed_form import ClosedFormArm
-from marl_handover.geometry.robot import read_robot, robot_config
+from marl_handover.geometry.robot import carried_robot, carry_robot, read_robot, robot_config
 from marl_handover.geometry.se2 import SE2
 
 SPREAD = 0.78
 """Distance between two bases, as a part of the sum of their outer radii: 360 mm for the paper's ring."""
+
+CARRIED = "robots"
+"""Folder of a run's own robots."""
 
 
 class CellModel(NamedTuple):
@@ -189,6 +193,18 @@ def _require_apart(names: Sequence[str], bases: Sequence[SE2], arms: Sequence[Cl
             if apart < least:
                 what = f"at least {least:.1f} mm from that of {names[first]!r}, whose base stands there"
                 raise InvalidSetting(f"the base of arm {names[second]!r}, {apart:.1f} mm away,", bases[second].position_mm.tolist(), what)
+
+
+def carry_robots(config: CellConfig, folder: Path) -> None:
+    """Copy the cell's own robots into ``folder``/robots, so that :func:`with_carried_robots` finds them there, wherever the folder goes."""
+    for robot in {config.robot, *(arm.robot for arm in config.arms)} - {""}:
+        carry_robot(robot, folder / CARRIED)
+
+
+def with_carried_robots(config: CellConfig, folder: Path) -> CellConfig:
+    """The cell with the robots that ``folder`` carries."""
+    arms = [replace(arm, robot=arm.robot and carried_robot(arm.robot, folder / CARRIED)) for arm in config.arms]
+    return replace(config, robot=carried_robot(config.robot, folder / CARRIED), arms=arms)
 
 
 def cell_config(name: str) -> CellConfig:

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import replace
 from pathlib import Path
 
-from marl_handover.compose import from_yaml
+from marl_handover.compose import from_yaml, to_yaml
 from marl_handover.config import MotionConfig, RobotConfig
 from marl_handover.errors import MissingFile, UnknownChoice, UnsupportedKinematics
-from marl_handover.files import expanded, resource_path
+from marl_handover.files import copy_whole, expanded, make_folder, resource_path, write_whole
 from marl_handover.geometry.canonical import PITCHES_DEG, canonical_arm, require_moving
 from marl_handover.geometry.capsules import touching_links
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.link_shapes import with_shapes
-from marl_handover.geometry.urdf import ArmDescription, read_urdf
+from marl_handover.geometry.urdf import ArmDescription, mesh_files, read_urdf
 from marl_handover.schema import option_names
 
 LEAST_RING_MM = 20.0
 """A ring that is narrower is none: no two arms share anything of it."""
 
+_CARRIED, _CARRIED_URDF = "robot.yaml", "robot.urdf"
 _YAML = (".yaml", ".yml")
 
 
@@ -115,3 +117,44 @@ def _width_mm(ring: tuple[float, float] | None) -> float:
 def describe(config: RobotConfig) -> ArmDescription:
     """A robot as the canonical arm. Raises as :func:`~marl_handover.geometry.canonical.canonical_arm` does."""
     return canonical_arm(read_urdf(config.urdf), config)
+
+
+def carry_robot(robot: str, folder: Path) -> None:
+    """Copy a robot that is not a shipped one, its settings, URDF and meshes, into ``folder``, where :func:`carried_robot` finds it.
+
+    Raises as :func:`robot_config` does, and :class:`CannotWrite`.
+    """
+    place = folder / _carried_name(robot)
+    if _is_shipped(robot) or folder in Path(robot).parents:
+        return
+    config = robot_config(robot)
+    source = Path(config.urdf)
+    make_folder(place)
+    copy_whole(source, place / _CARRIED_URDF)
+    copy_whole(source, place / _CARRIED_URDF)
+    for filename, mesh in mesh_files(source).items():
+        inside = Path(filename.partition("://")[2].partition("/")[2] if "://" in filename else filename)
+        if mesh.is_file() and not inside.is_absolute() and ".." not in inside.parts:
+            make_folder((place / inside).parent)
+            copy_whole(mesh, place / inside)
+    write_whole(place / _CARRIED, to_yaml(replace(config, urdf=_CARRIED_URDF)))
+
+
+def carried_robot(robot: str, folder: Path) -> str:
+    """The robot as ``folder`` carries it: the path of its settings there; ``robot`` as it is where it is shipped, or is not carried."""
+    if _is_shipped(robot):
+        return robot
+    parts = Path(robot).parts
+    name = parts[-2] if parts[-1:] == (_CARRIED,) and len(parts) > 1 else _carried_name(robot)
+    found = folder / name / _CARRIED
+    return str(found) if found.is_file() else robot
+
+
+def _is_shipped(robot: str) -> bool:
+    if Path(robot).parent != Path() or Path(robot).is_file():
+        return False
+    return robot in option_names(resource_path("configs/robot")) or (resource_path("urdf") / robot).is_file()
+
+
+def _carried_name(robot: str) -> str:
+    return f"{Path(robot).stem}-{hashlib.sha256(robot.encode()).hexdigest()[:8]}"

@@ -417,6 +417,12 @@ def mesh_path(urdf: Path, filename: str) -> Path:
     return next((place for place in [*places, urdf.parent / inside] if place.is_file()), urdf.parent / inside)
 
 
+def mesh_files(urdf: Path) -> dict[str, Path]:
+    """Names of all meshes as a URDF writes them, and the files that they mean. Raises as :func:`read_urdf` does."""
+    names = {mesh.get("filename", "") for mesh in _parse(urdf).iter("mesh")}
+    return {name: mesh_path(urdf, name) for name in sorted(names - {""})}
+
+
 def _inertial(path: Path, where: str, element: ET.Element | None) -> Inertial | None:
     if element is None:
         return None

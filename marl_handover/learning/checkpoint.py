@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from marl_handover.cell import load_cell
+from marl_handover.cell import load_cell, with_carried_robots
 from marl_handover.compose import from_text
 from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, MissingFile, first_line
 from marl_handover.files import open_bounded, writing
@@ -166,6 +166,7 @@ def run_arrays(folder: Path) -> Arrays:
 
 
 def train_config(text: str, path: Path) -> TrainConfig:
-    """The settings stored in a checkpoint as YAML text."""
+    """The settings stored in a checkpoint, or beside it, as YAML text; its robots are those that its folder carries."""
     config: TrainConfig = from_text(TrainConfig, text, path, {"algorithm": ALGORITHMS})
+    config.cell = with_carried_robots(config.cell, path.parent)
     return config

@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from marl_handover.cell import load_cell
+from marl_handover.cell import carry_robots, load_cell
 from marl_handover.compose import to_yaml
 from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, WorkFailed, first_line
 from marl_handover.files import remove_temporaries, write_whole
@@ -111,6 +111,7 @@ class Trainer:
             return self._summarise()
 
     def _train(self) -> None:
+        carry_robots(self.config.cell, self.folder)
         write_whole(self.folder / "config.yaml", to_yaml(self.config))
         recorder = Recorder(self.folder, self.config.steps, self.counters.step, self.config.progress)
         started = time.perf_counter() - self.counters.wall_s
