@@ -123,8 +123,6 @@ def test_inverse_kinematics_hold_the_pin(model):
 
 
 def test_every_place_can_be_picked_from(model):
-    if model.cell.config.name == "so101":
-        pytest.skip("its parked pose is not found yet")
     planner, fit, generator = MotionPlanner(model), model.fit, np.random.default_rng(4)
     for number in range(8):
         arm = number % 2
