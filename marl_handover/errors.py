@@ -234,14 +234,16 @@ class UnconnectedArms(HandoverError):
 
 
 class OutOfReach(HandoverError):
-    """A position that no arm can reach."""
+    """A position that no arm can reach. ``rings_mm``: least and greatest radius of each arm, by its name."""
 
-    def __init__(self, what: str, position_mm: tuple[float, float], r_min_mm: float, r_max_mm: float) -> None:
-        self.what, self.position_mm = what, position_mm
-        self.r_min_mm, self.r_max_mm = r_min_mm, r_max_mm
+    def __init__(self, what: str, position_mm: tuple[float, float], rings_mm: Mapping[str, tuple[float, float]]) -> None:
+        self.what, self.position_mm, self.rings_mm = what, position_mm, dict(rings_mm)
+        alike = len(set(self.rings_mm.values())) == 1
+        rings = {"a base": next(iter(self.rings_mm.values()))} if alike else {f"that of {name!r}": ring for name, ring in rings_mm.items()}
+        allowed = " or ".join(f"{low:g} to {high:g} mm from {base}" for base, (low, high) in rings.items())
         super().__init__(
             f"{what} ({position_mm[0]:g}, {position_mm[1]:g}) mm is out of every arm's reach; "
-            f"it must lie {r_min_mm:g} to {r_max_mm:g} mm from a base, within the arm's yaw range"
+            f"it must lie {allowed}, within the arm's yaw range"
         )
 
 

@@ -49,6 +49,12 @@ class Arm:
         good = (radius >= self.r_min_mm - REACH_TOLERANCE_MM) & (radius <= self.r_max_mm + REACH_TOLERANCE_MM)
         return np.asarray(good & (yaw >= self.yaw_rad[0] - slack) & (yaw <= self.yaw_rad[1] + slack))
 
+    def at(self, radius_mm: ArrayLike, yaw_rad: ArrayLike) -> NDArray[np.float64]:
+        """World points (..., 2) of the grip at distances (...) from the base and base yaws (...)."""
+        if self.lateral_mm:
+            yaw_rad = np.asarray(yaw_rad, float) + lateral_rad(self.lateral_mm, radius_mm)
+        return self.base.around(radius_mm, yaw_rad)
+
 
 def lateral_rad(lateral_mm: ArrayLike, radius_mm: ArrayLike) -> NDArray[np.float64]:
     """How far to the left of an arm's vertical plane its grip is seen from the yaw axis, ``radius_mm`` away: elementwise, broadcast.

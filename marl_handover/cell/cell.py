@@ -211,7 +211,7 @@ class Cell:
         with np.errstate(over="ignore"):  # of absurd coordinates; infinitely far is out of reach too
             reached = bool(self.reaches(np.asarray(pose, float)).any())
         if not reached:
-            raise OutOfReach(what, (float(pose[0]), float(pose[1])), self.r_min_mm, self.r_max_mm)
+            raise OutOfReach(what, (float(pose[0]), float(pose[1])), {arm.name: (arm.r_min_mm, arm.r_max_mm) for arm in self.arms})
 
     def clamp_to_workspace(self, pose: Array, slack_mm: float) -> Array:
         """``pose`` (3,) as a supervisor is to see it.

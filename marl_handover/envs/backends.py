@@ -233,7 +233,10 @@ class TopView:
 
     def __init__(self, cell: Cell) -> None:
         self.side_mm = cell.config.block.side_mm
-        self.half_mm = max(cell.r_max_mm, *(max(abs(base.x_mm), abs(base.y_mm)) + self.side_mm for base in cell.bases)) + MARGIN_MM
+        self.half_mm = (
+            max(*(arm.r_max_mm for arm in cell.arms), *(max(abs(base.x_mm), abs(base.y_mm)) + self.side_mm for base in cell.bases))
+            + MARGIN_MM
+        )
         ticks = np.linspace(-self.half_mm, self.half_mm, SIZE_PX)
         self._x, self._y = np.broadcast_to(ticks, (SIZE_PX, SIZE_PX)), np.broadcast_to(ticks[::-1, None], (SIZE_PX, SIZE_PX))
         self._line_mm = 2 * self.half_mm / SIZE_PX  # half of a line's width: lines are two pixels wide

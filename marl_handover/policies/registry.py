@@ -149,8 +149,7 @@ def _made(name: str, arrays: Arrays, cell: Cell | None, task: TaskConfig | None,
 def _try_out(policy: SupervisorPolicy) -> None:
     """Ask a policy for two decisions, so that what cannot act is refused when it is loaded. Raises whatever that raises."""
     cell = policy.rules.cell
-    middle_mm = (cell.r_min_mm + cell.r_max_mm) / 2
-    pose = np.array([[*base.to_world([middle_mm, 0.0]), 0.0] for base in cell.bases])
+    pose = np.array([[*arm.at((arm.r_min_mm + arm.r_max_mm) / 2, sum(arm.yaw_rad) / 2), 0.0] for arm in cell.arms])
     with np.errstate(all="ignore"):
         action = policy.act(pose, pose[::-1], np.arange(len(pose)) - 1)
     size = policy.rules.action_size

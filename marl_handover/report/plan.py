@@ -28,7 +28,7 @@ def workspace_figure(model: CellModel) -> Figure:
     reached = grid.masks.sum(0)
     for arm, mask in enumerate(grid.masks):
         alone = points[mask & (reached == 1)]
-        label = f"grid: {ARM_LETTERS[arm]} alone, {len(alone)}"
+        label = f"grid: {cell.labels[arm]} alone, {len(alone)}"
         axes.scatter(alone[:, 0], alone[:, 1], s=2.5, color=arm_colour(arm), linewidths=0, label=label, rasterized=True)
     both = points[reached > 1]
     axes.scatter(both[:, 0], both[:, 1], s=4.5, color=SHARED, linewidths=0, label=f"grid: both, {len(both)}", rasterized=True)
@@ -40,12 +40,20 @@ def workspace_figure(model: CellModel) -> Figure:
     axes.set_xlabel("x [mm]")
     axes.set_ylabel("y [mm]")
     axes.set_title(
-        f"cell {cell.config.name}: annulus {cell.r_min_mm:g} to {cell.r_max_mm:g} mm, bases {cell.config.base_distance_mm:g} mm apart, "
-        f"grid {cell.config.grid_mm:g} mm",
+        f"cell {cell.config.name}: {_rings(cell)}{_apart(cell)}, grid {cell.config.grid_mm:g} mm",
         fontsize=10,
     )
     figure.legend(loc="outside lower center", ncols=4, fontsize=8, markerscale=3, frameon=False)
     return figure
+
+
+def _rings(cell: Cell) -> str:
+    rings = [f"{arm.r_min_mm:g} to {arm.r_max_mm:g} mm" for arm in cell.arms]
+    return f"annulus {rings[0]}" if len(set(rings)) == 1 else f"annuli {', '.join(rings)}"
+
+
+def _apart(cell: Cell) -> str:
+    return f", bases {cell.base_distance_mm:g} mm apart" if cell.num_arms == 2 else ""
 
 
 PANEL_INCHES, LEGEND_INCHES = 2.9, 7.5

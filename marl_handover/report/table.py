@@ -11,7 +11,6 @@ from matplotlib.patches import Circle, Polygon
 
 from marl_handover.arrays import Floats
 from marl_handover.cell.cell import Cell
-from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.report.figure_style import FAINT, INK, PAPER, arm_colour, arm_line
 
 Axes = Any
@@ -20,10 +19,11 @@ Axes = Any
 
 def sector_mm(cell: Cell, arm: int, points: int = 90) -> Floats:
     """Outline (n, 2) of an arm's annulus sector."""
-    base = cell.bases[arm]
-    angle = base.facing_rad + np.linspace(*cell.yaw_rad, points)
-    ray = np.stack([np.cos(angle), np.sin(angle)], -1)
-    return base.position_mm + np.concatenate([cell.r_max_mm * ray, cell.r_min_mm * ray[::-1]])
+    each = cell.arms[arm]
+    yaw = np.linspace(*each.yaw_rad, points)
+    along = np.linspace(each.r_max_mm, each.r_min_mm, points)  # a grip beside the plane moves along a curve
+    sides = [each.at(along, each.yaw_rad[1]), each.at(along[::-1], each.yaw_rad[0])] if each.lateral_mm else []
+    return np.concatenate([each.at(each.r_max_mm, yaw), *sides[:1], each.at(each.r_min_mm, yaw[::-1]), *sides[1:]])
 
 
 def frame_table(axes: Axes, cell: Cell, margin_mm: float = 25.0) -> None:
@@ -41,7 +41,7 @@ def draw_sectors(axes: Axes, cell: Cell, strength: float = 0.1, width: float = 1
     for arm in range(cell.num_arms):
         outline, colour = sector_mm(cell, arm), arm_colour(arm)
         axes.add_patch(Polygon(outline, closed=True, facecolor=colour, edgecolor="none", alpha=strength, zorder=1))
-        label = f"annulus sector of {ARM_LETTERS[arm]}" if labelled else None
+        label = f"annulus sector of {cell.labels[arm]}" if labelled else None
         edge = Polygon(outline, closed=True, fill=False, edgecolor=colour, linewidth=width, linestyle=arm_line(arm), label=label, zorder=3)
         axes.add_patch(edge)
 
@@ -50,7 +50,7 @@ def draw_circles(axes: Axes, cell: Cell) -> None:
     """Both whole circles around each base, faint, to show what the yaw limits cut off."""
     label: str | None = "beyond the yaw limits"
     for arm, base in enumerate(cell.bases):
-        for radius in (cell.r_min_mm, cell.r_max_mm):
+        for radius in (cell.arms[arm].r_min_mm, cell.arms[arm].r_max_mm):
             style: dict[str, Any] = {"linewidth": 0.7, "linestyle": ":", "alpha": 0.7, "zorder": 2}
             axes.add_patch(Circle((base.x_mm, base.y_mm), radius, fill=False, edgecolor=arm_colour(arm), label=label, **style))
             label = None
@@ -61,7 +61,7 @@ def draw_bases(axes: Axes, cell: Cell, size: float = 13.0) -> None:
     for arm, base in enumerate(cell.bases):
         axes.plot(base.x_mm, base.y_mm, "s", color=arm_colour(arm), markersize=size, zorder=11)
         letter = {"color": PAPER, "ha": "center", "va": "center", "fontsize": 0.65 * size, "fontweight": "bold", "zorder": 12}
-        axes.text(base.x_mm, base.y_mm, ARM_LETTERS[arm], **letter)
+        axes.text(base.x_mm, base.y_mm, cell.labels[arm][:1], **letter)
 
 
 def draw_chart(axes: Axes, cell: Cell, inner: Sequence[float] = (-0.5, 0.0, 0.5), label: str | None = "chart (α, β)") -> None:

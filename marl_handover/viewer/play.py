@@ -127,13 +127,13 @@ def within_reach(cell: Cell, pose: Floats) -> Floats:
 
 def _of_sector(cell: Cell, arm: int, point_mm: Floats) -> Floats:
     """Points (n, 2) of one arm's annulus sector, the nearest to ``point_mm`` among them: on its arcs, its straight edges, its corners."""
-    base = cell.bases[arm]
-    centre, (low, high) = base.position_mm, cell.yaw_rad
+    each = cell.arms[arm]
+    low, high = each.yaw_rad
     square, yaw = (float(value[arm]) for value in cell.polar(point_mm))
     radius = math.sqrt(square)
-    at = [(float(np.clip(radius, cell.r_min_mm, cell.r_max_mm)), float(np.clip(yaw, low, high)))]
-    at += [(float(np.clip(radius * math.cos(yaw - edge), cell.r_min_mm, cell.r_max_mm)), edge) for edge in (low, high)]
-    return np.array([centre + r * np.array([math.cos(base.facing_rad + a), math.sin(base.facing_rad + a)]) for r, a in at])
+    at = [(float(np.clip(radius, each.r_min_mm, each.r_max_mm)), float(np.clip(yaw, low, high)))]
+    at += [(float(np.clip(radius * math.cos(yaw - edge), each.r_min_mm, each.r_max_mm)), edge) for edge in (low, high)]
+    return np.array([each.at(r, a) for r, a in at])
 
 
 RATE_HZ = 50.0

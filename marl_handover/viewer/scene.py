@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.arrays import Floats
 from marl_handover.cell import Cell, CellModel
-from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import BlockConfig
 from marl_handover.geometry.se3 import transform
 from marl_handover.geometry.urdf import ARM_JOINTS, Joint, Primitive
@@ -181,7 +180,7 @@ def add_table(server: viser.ViserServer, cell: Cell) -> None:
     server.scene.add_box("/table", color=WOOD, dimensions=metres([2 * half[0], 2 * half[1], 15.0]), position=metres([0, 0, -7.5]))
     for arm, outline in enumerate(outlines):
         _add_line(server, f"/reach_{arm}", outline, arm_colour(arm), _OUTLINE_MM, 1.6)
-        base, name = cell.bases[arm], _NAMES.get(ARM_LETTERS[arm], f"arm {ARM_LETTERS[arm]}")
+        base, name = cell.bases[arm], _NAMES.get(cell.labels[arm], f"arm {cell.labels[arm]}")
         beyond = 1 + 35.0 / math.hypot(base.x_mm, base.y_mm)
         server.scene.add_label(f"/name_{arm}", name, position=metres([base.x_mm * beyond, base.y_mm * beyond, 0.0]), anchor="center-center")
     vertices, faces = shared_mesh(cell)
@@ -194,11 +193,9 @@ def add_table(server: viser.ViserServer, cell: Cell) -> None:
 
 def sector_outline(cell: Cell, arm: int) -> Floats:
     """The closed outline (n, 2) in mm of the annulus sector where an arm can pick and place."""
-    base, (low, high) = cell.bases[arm], cell.yaw_rad
-    angles = base.facing_rad + np.linspace(low, high, _POINTS)
-    rays = np.stack([np.cos(angles), np.sin(angles)], -1)
-    around = np.concatenate([cell.r_max_mm * rays, cell.r_min_mm * rays[::-1], cell.r_max_mm * rays[:1]])
-    return base.position_mm + around
+    each = cell.arms[arm]
+    yaw = np.linspace(*each.yaw_rad, _POINTS)
+    return np.concatenate([each.at(each.r_max_mm, yaw), each.at(each.r_min_mm, yaw[::-1]), each.at(each.r_max_mm, yaw[:1])])
 
 
 def shared_mesh(cell: Cell) -> tuple[Floats, NDArray[np.uint32]]:
