@@ -69,7 +69,7 @@ def run(config: RobotCommandConfig) -> int:
 def _read(settings: RobotConfig, may_lack_meshes: bool) -> ClosedFormArm:
     """The robot's kinematics and shapes; without shapes where its meshes are missing and that may be."""
     description = describe(settings)
-    require_moving(description, settings, needs_speed=False)
+    require_moving(description, needs_speed=False)
     arm = ClosedFormArm(description, settings.joint_limits_deg)
     require_ring(arm, settings)
     try:

@@ -14,7 +14,7 @@ import numpy as np
 
 from marl_handover.arrays import Floats
 from marl_handover.config import RobotConfig
-from marl_handover.errors import UrdfError
+from marl_handover.errors import UrdfError, listed
 from marl_handover.geometry.closed_form import ring_by_limits_mm
 from marl_handover.geometry.hand import Hand, find_hand
 from marl_handover.geometry.roles import Roles, find_roles, joint_range, nearest_turn_rad, require_pitch
@@ -72,6 +72,8 @@ def canonical_arm(tree: UrdfTree, config: RobotConfig) -> ArmDescription:
     notes = (
         tuple(f"locked: {name} at {math.degrees(reading.roles.locked[name]):.4g} deg" for name in reading.roles.proposed)
         + reading.hand.assumed
+        + tree.assumed
+        + _without_effort(reading.roles)
     )
     if _is_canonical(skeleton, reading, config):
         joints = tuple(replace(joint, mimic=None) if joint.name in ARM_JOINTS else joint for joint in tree.joints)
@@ -262,14 +264,19 @@ def _moved(link: Link, T: Floats) -> Link:
     )
 
 
-def require_moving(description: ArmDescription, config: RobotConfig, needs_speed: bool = True) -> None:
-    """Raise :class:`UrdfError` for an arm joint that cannot move, by its speed or its effort; the file and the joint are named.
+def _without_effort(roles: Roles) -> tuple[str, ...]:
+    lacking = [joint.name for joint in roles.joints if joint.effort == 0]
+    return (f"effort 0 of {listed(lacking, 80)}: the URDF does not say how strong they are; physics asks for it",) if lacking else ()
 
-    ``needs_speed`` False: for kinematics alone, a joint is refused only where it has neither.
+
+def require_moving(description: ArmDescription, needs_speed: bool = True) -> None:
+    """Raise :class:`UrdfError` for an arm joint without speed; the file and the joint are named.
+
+    ``needs_speed`` False: for kinematics alone, a joint is refused only where it has no effort, either.
     """
     for role, source in zip(ARM_JOINTS, description.sources, strict=True):
         joint = description.joint(role)
         lacking = [name for name in ("velocity", "effort") if getattr(joint, name) <= 0]
-        if source.joint is not None and lacking and (needs_speed or len(lacking) == 2):
+        if source.joint is not None and "velocity" in lacking and (needs_speed or len(lacking) == 2):
             problem = f"joint {source.joint!r} has {' and '.join(f'{name} 0' for name in lacking)} in its <limit>; it must be above 0"
             raise UrdfError(description.path, problem)

@@ -70,7 +70,7 @@ def read_robot(config: RobotConfig) -> ClosedFormArm:
         UnknownKey, InvalidSetting: of limits.
     """
     description = describe(config)
-    require_moving(description, config)
+    require_moving(description)
     arm = ClosedFormArm(description, config.joint_limits_deg)
     require_ring(arm, config)
     return shaped_arm(arm, config)

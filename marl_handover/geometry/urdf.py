@@ -12,7 +12,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NoReturn
 
@@ -35,8 +35,8 @@ _OTHER_FORMATS = {
 }
 
 _MOST_FOLDERS = 6
-MOST_ELEMENTS, LARGEST = 1000, 1e6
-"""What a file may have: so many links and joints, and no number beyond, whatever its unit."""
+MOST_ELEMENTS, LARGEST, LARGEST_LIMIT = 1000, 1e6, 1e20
+"""What a file may have: so many links and joints, and no number beyond, whatever its unit; limits may be as good as none."""
 
 
 @dataclass(frozen=True)
@@ -129,13 +129,17 @@ class Joint:
 
 @dataclass(frozen=True)
 class UrdfTree:
-    """What a URDF says: its links, and its joints sorted, each after the one that carries its parent link."""
+    """What a URDF says: its links, and its joints sorted, each after the one that carries its parent link.
+
+    ``assumed``: what was left out, in words.
+    """
 
     path: Path
     name: str
     root: str
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
+    assumed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -247,7 +251,15 @@ def read_urdf(path: Path | str) -> UrdfTree:
     _refuse_strange_mimics(path, joints)
     root, joints = _sort_tree(path, [link.name for link in links], joints)
     there = {root, *(joint.child for joint in joints)}
-    return UrdfTree(path, robot.get("name") or path.stem, root, tuple(link for link in links if link.name in there), joints)
+    links, assumed = _without_points([link for link in links if link.name in there])
+    return UrdfTree(path, robot.get("name") or path.stem, root, links, joints, assumed)
+
+
+def _without_points(links: Sequence[Link]) -> tuple[tuple[Link, ...], tuple[str, ...]]:
+    """The links without collision shapes of size 0, which stand for none; and whose these were, in words."""
+    solid = [replace(link, collisions=tuple(shape for shape in link.collisions if any(shape.size_mm))) for link in links]
+    lost = [link.name for link, left in zip(links, solid, strict=True) if len(left.collisions) < len(link.collisions)]
+    return tuple(solid), (f"shapes of size 0 are none: those of {listed(lost, 80)}",) if lost else ()
 
 
 def _fail(path: Path, problem: str) -> NoReturn:
@@ -274,7 +286,7 @@ def _parse(path: Path) -> ET.Element:
     if robot.tag != "robot":
         _fail(path, f"its outermost element is <{robot.tag[:40]}>; it must be <robot>" + _hint(_OTHER_FORMATS.get(robot.tag, "")))
     parts = [part for tag in ("link", "joint") for part in robot.findall(tag)]
-    commands = any("xacro" in each.tag and not each.tag.endswith("property") for each in robot.iter())
+    commands = any("xacro" in each.tag and not each.tag.endswith(("property", "arg")) for each in robot.iter())
     if commands or any("${" in value for part in parts for each in part.iter() for value in each.attrib.values()):
         _fail(path, xacro)
     return robot
@@ -325,8 +337,9 @@ def _numbers(path: Path, element: ET.Element, name: str) -> tuple[float, ...]:
         raise UrdfError(path, f"<{element.tag} {name}={shown(text, 60)}> is not a number") from None
     if not values or not all(math.isfinite(value) for value in values):
         _fail(path, f"<{element.tag} {name}={shown(text, 60)}>: every number must be finite")
-    if any(abs(value) > LARGEST for value in values):
-        _fail(path, f"<{element.tag} {name}={shown(text, 60)}>: no number may be beyond {LARGEST:g}")
+    largest = LARGEST_LIMIT if element.tag == "limit" else LARGEST
+    if any(abs(value) > largest for value in values):
+        _fail(path, f"<{element.tag} {name}={shown(text, 60)}>: no number may be beyond {largest:g}")
     return values
 
 
@@ -396,7 +409,7 @@ def _shape(path: Path, where: str, element: ET.Element) -> Primitive | Mesh:
     else:
         found = f"no {element.tag} shape" if shape is None else f"the {element.tag} shape <{shape.tag}>"
         _fail(path, f"{where} has {found}; only box, cylinder, sphere and mesh are supported")
-    if min(size) <= 0 and element.tag == "collision":
+    if min(size) <= 0 and any(size) and element.tag == "collision":
         _fail(path, f"{where} has a <{shape.tag}> with a size that is not above 0")
     return Primitive("cylinder" if shape.tag == "capsule" else shape.tag, size, *_origin(path, element))
 

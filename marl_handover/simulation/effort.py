@@ -27,6 +27,10 @@ def require_effort(model: CellModel, motion: MotionConfig, homes_rad: Floats) ->
         if id(arm) in checked:
             continue
         checked.add(id(arm))
+        for role, source in zip(ARM_JOINTS, arm.description.sources, strict=True):
+            if source.joint is not None and arm.description.joint(role).effort <= 0:
+                problem = f"joint {source.joint!r} has effort 0 in its <limit>, and moves nothing in physics; say how strong it is"
+                raise UrdfError(arm.description.path, problem)
         height_mm, radii = model.cell.pick_heights_mm[index], np.linspace(ring.r_min_mm, ring.r_max_mm, RADII)
         places = np.array([[r, 0.0, z] for z in (height_mm, height_mm + motion.lift_mm) for r in radii])
         q = arm.ik(places).reshape(-1, 5)

@@ -120,3 +120,16 @@ def test_missing_file_is_named(tmp_path: Path) -> None:
 def test_another_tip_is_looked_for() -> None:
     with pytest.raises(UrdfError, match="link 'claw', the tip, is missing; it has: .*grip"):
         describe(replace(robot_config("al5a"), tip="claw"))
+
+
+def test_what_a_generator_leaves_behind_says_nothing(tmp_path):
+    """A xacro property that nothing uses, shapes of size 0, limits that are as good as none."""
+    text = TEXT.replace("<robot", '<robot xmlns:xacro="http://ros.org/xacro"', 1).replace(
+        "</robot>", '<xacro:property name="w" value="1"/></robot>'
+    )
+    text = text.replace('<box size="0.084 0.022 0.016"/>', '<sphere radius="0.0"/>').replace('effort="0.59"', 'effort="1e16"')
+    (tmp_path / "left.urdf").write_text(text)
+    tree = read_urdf(tmp_path / "left.urdf")
+    assert next(link for link in tree.links if link.name == "upper_arm").collisions == ()
+    assert tree.assumed == ("shapes of size 0 are none: those of upper_arm",)
+    assert next(joint for joint in tree.joints if joint.name == "base_yaw").effort == 1e16

@@ -126,6 +126,10 @@ def test_a_joint_too_weak_to_hold_the_arm_is_named(tmp_path):
     weak = build_cell(replace(MEDIUM, name="weak", effort=0.5 * needed).cell(tmp_path, grid_mm=10.0))
     with pytest.raises(UrdfError, match=r"weak.urdf: joint 'shoulder' has effort .* N m in its <limit>, and needs .* to hold the arm up"):
         require_effort(weak, MotionConfig(), homes)
+    unknown = build_cell(replace(MEDIUM, name="unknown", effort=0.0).cell(tmp_path, grid_mm=10.0))
+    assert any("effort 0 of base_yaw" in note for note in unknown.arm.description.assumed)
+    with pytest.raises(UrdfError, match=r"unknown.urdf: joint 'base_yaw' has effort 0 in its <limit>"):
+        require_effort(unknown, MotionConfig(), homes)
 
 
 def test_what_holds_an_arm_up_is_the_slope_of_its_height(tmp_path):
