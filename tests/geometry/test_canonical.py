@@ -294,9 +294,9 @@ def test_six_axes_without_masses_shapes_or_speed_are_read(tmp_path: Path) -> Non
     description = describe(RobotConfig(urdf=str(path)))
     assert [source.joint for source in description.sources] == ["j1", "j2", "j3", "j4", "j6"]
     assert description.locked == (("j5", 0.0),)
-    require_moving(description, RobotConfig(), needs_speed=False)
+    require_moving(description, needs_speed=False)
     with pytest.raises(UrdfError, match="joint 'j1' has velocity 0"):
-        require_moving(description, RobotConfig())
+        require_moving(description)
 
 
 def test_a_finger_is_no_wrist_pitch(tmp_path: Path) -> None:
