@@ -111,6 +111,14 @@ def present_names(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {key: options.get((key, value), value) if isinstance(value, str) else value for key, value in named.items()}
 
 
+def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted key."""
+    found: dict[str, Any] = {}
+    for key, value in tree.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
+
+
 def _fitted_tree(schema: type, tree: Mapping[Any, Any], path: Path, groups: Groups | None, stored: bool = False) -> Any:
     composer = _Composer(schema, groups or {}, {}, path.parent, stored)
     try:

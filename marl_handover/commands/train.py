@@ -6,7 +6,7 @@ import sys
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from marl_handover.config import CELL_ALIASES
 from marl_handover.errors import CheckpointMismatch, InvalidSetting, MissingFile
@@ -84,6 +84,7 @@ def resumed(folder: Path, asked: TrainConfig | None = None) -> Trainer:
     Raises:
         CheckpointMismatch: ``asked`` changes a setting; a run keeps the ones it was started with.
     """
+    from marl_handover.compose import flat
     from marl_handover.learning.checkpoint import FILE, load_checkpoint, train_config
     from marl_handover.learning.trainer import Trainer
 
@@ -92,7 +93,7 @@ def resumed(folder: Path, asked: TrainConfig | None = None) -> Trainer:
     text = read_bounded(source, YAML_BYTES, "settings").decode(errors="replace") if unsaved else load_checkpoint(folder)["config"]
     config = train_config(text, source)
     asked = asked or TrainConfig(progress=False)
-    own, wanted, default = (_flat(asdict(settings)) for settings in (config, asked, TrainConfig()))
+    own, wanted, default = (flat(asdict(settings)) for settings in (config, asked, TrainConfig()))
     for key, value in wanted.items():
         if key not in FREE_ON_RESUME and value != default.get(key) and value != own.get(key):
             raise CheckpointMismatch(source, key, own.get(key), value)
@@ -101,11 +102,3 @@ def resumed(folder: Path, asked: TrainConfig | None = None) -> Trainer:
     if not unsaved:
         trainer.restore()
     return trainer
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted key."""
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat

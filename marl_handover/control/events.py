@@ -249,8 +249,7 @@ class SessionDigest:
     def _goal(self, row: dict[str, Any]) -> None:
         self.goal = row["goal"]
 
-    def _goal_changed(self, row: dict[str, Any]) -> None:
-        self.goal = row["goal"]
+    _goal_changed = _goal
 
     def _seen(self, row: dict[str, Any]) -> None:
         self.pose = row["pose"]

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from marl_handover.compose import present_names
+from marl_handover.compose import flat, present_names
 from marl_handover.control.evaluation import AssessmentConfig
 from marl_handover.errors import HandoverError
 from marl_handover.files import package_path, read_bounded, write_whole
@@ -44,20 +44,12 @@ DONE_KEYS: Needed = {"row": str, "seed": int, "evaluations": dict}
 
 def settings_of(config: TrainConfig | AssessmentConfig) -> Settings:
     """All settings by dotted key, as JSON has them, without those that only say where things are."""
-    flat = _flat(parse_json(json.dumps(asdict(config))))
-    return {key: value for key, value in flat.items() if key not in PLACES}
+    return {key: value for key, value in flat(parse_json(json.dumps(asdict(config)))).items() if key not in PLACES}
 
 
 def fingerprint(settings: Settings) -> str:
     """Short hash of settings."""
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> Settings:
-    flat: Settings = {}
-    for key, value in tree.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat
 
 
 def usual_settings(config: TrainConfig | AssessmentConfig) -> Settings:

@@ -176,7 +176,6 @@ def value_of(config: TrainConfig, key: str) -> Any:
     return value
 
 
-PRUNERS = ("median", "hyperband", "none")
 STARTUP_TRIALS = 5
 """Finished trials before the median is one."""
 
