@@ -132,6 +132,7 @@ def _text(summary: dict[str, Any], arm: ClosedFormArm, settings: RobotConfig) ->
         rows.append(("", _clear_ring(arm, settings)))
     beside = f" - asin({arm.lateral_mm:.3g} / distance)" if abs(arm.lateral_mm) > 1e-3 else ""
     rows.append(("yaw law", f"base yaw = direction of the place{beside}; what is held turns with it"))
+    rows += [("not checked", f"{one} against {other}: they touch in every posture") for one, other in arm.description.ignored]
     return "\n".join([*(f"{name:<12} {value}" for name, value in rows), *(f"assumed      {note}" for note in summary["assumed"])])
 
 

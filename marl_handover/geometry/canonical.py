@@ -24,6 +24,8 @@ from marl_handover.geometry.urdf import ARM_JOINTS, ArmDescription, Joint, Joint
 
 _EXACT_MM = 1e-9
 _AHEAD_MM = 20.0
+LEAST_RING_MM = 20.0
+"""A ring that is narrower is none: no two arms share anything of it."""
 PITCHES_DEG = (-15.0, -30.0, -45.0, -60.0, -75.0, -85.0, 0.0, 15.0, 30.0)
 """Of a hand, that are tried where the asked one has no ring."""
 
@@ -66,9 +68,9 @@ def canonical_arm(tree: UrdfTree, config: RobotConfig) -> ArmDescription:
         hand = find_hand(skeleton, roles, config)
         require_pitch(config, len(roles.joints) == 5)
         readings.append(_front([_read(skeleton, roles, hand, config, side) for side in (1.0, -1.0)], config))
-        if readings[-1].ring_mm is not None:
+        if readings[-1].width_mm >= LEAST_RING_MM:
             break
-    reading = next((each for each in readings if each.ring_mm is not None), readings[0])
+    reading = next((each for each in readings if each.width_mm >= LEAST_RING_MM), readings[0])
     notes = (
         tuple(f"locked: {name} at {math.degrees(reading.roles.locked[name]):.4g} deg" for name in reading.roles.proposed)
         + reading.hand.assumed

@@ -11,15 +11,12 @@ from marl_handover.compose import from_yaml, to_yaml
 from marl_handover.config import MotionConfig, RobotConfig
 from marl_handover.errors import MissingFile, UnknownChoice, UnsupportedKinematics
 from marl_handover.files import copy_whole, expanded, make_folder, resource_path, write_whole
-from marl_handover.geometry.canonical import PITCHES_DEG, canonical_arm, require_moving
+from marl_handover.geometry.canonical import LEAST_RING_MM, PITCHES_DEG, canonical_arm, require_moving
 from marl_handover.geometry.capsules import touching_links
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.link_shapes import with_shapes
 from marl_handover.geometry.urdf import ArmDescription, mesh_files, read_urdf
 from marl_handover.schema import option_names
-
-LEAST_RING_MM = 20.0
-"""A ring that is narrower is none: no two arms share anything of it."""
 
 _CARRIED, _CARRIED_URDF = "robot.yaml", "robot.urdf"
 _YAML = (".yaml", ".yml")

@@ -22,6 +22,9 @@ from marl_handover.geometry.urdf import ARM_JOINTS, Joint
 PARALLEL_RAD = 1e-3
 """Axes that differ by less are parallel: files round their angles."""
 MOST_LOCKS = 3
+_MOST_ANGLES = 4
+_TURNS_RAD = 3.5
+"""A hinge that turns farther moves no finger."""
 _LEAST_LINK_MM = 1.0
 _BESIDE_MM = 5.0
 _ALONG = 0.5
@@ -76,7 +79,7 @@ def find_roles(skeleton: Skeleton, config: RobotConfig) -> list[Roles]:
     if rivals:
         names = listed(sorted({best[1].hand, *rivals}), 80)
         raise UrdfError(skeleton.tree.path, f"it has more than one hand ({names}); say which with tip: LINK in the robot's YAML file")
-    return [roles for _, roles in ranked if roles.hand == best[1].hand]
+    return [roles for key, roles in ranked if key[:5] == best[0][:5] and roles.hand == best[1].hand]
 
 
 def _require_known(skeleton: Skeleton, config: RobotConfig) -> None:
@@ -129,7 +132,8 @@ def finger_joints(skeleton: Skeleton, hand: str, config: RobotConfig) -> list[Jo
     sliding = [joint for joint in skeleton.moving[hand] if joint.kind == "prismatic"]
     if sliding:
         return sliding
-    return [joint for joint in skeleton.moving[hand] if _is_jaw(skeleton, joint)]
+    hinges = [joint for joint in skeleton.moving[hand] if joint.kind == "revolute"]
+    return hinges if len(hinges) > 1 else [joint for joint in skeleton.moving[hand] if _is_jaw(skeleton, joint)]
 
 
 def _is_jaw(skeleton: Skeleton, joint: Joint) -> bool:
@@ -138,6 +142,8 @@ def _is_jaw(skeleton: Skeleton, joint: Joint) -> bool:
         return False
     if joint.mimic is not None or any(other.mimic is not None and other.mimic.joint == joint.name for other in skeleton.above.values()):
         return True
+    if joint.kind == "revolute" and joint.upper - joint.lower > _TURNS_RAD:
+        return False
     frames = skeleton.frames({})
     axis, way = skeleton.axis(joint, frames), hand_point(skeleton, joint.child, frames) - frames[joint.child][:3, 3]
     if np.linalg.norm(way) < _LEAST_LINK_MM:  # nothing is known of it: hinges of fingers are beside the axis before them
@@ -186,11 +192,12 @@ def _readings(skeleton: Skeleton, hand: str, config: RobotConfig) -> Iterator[Ro
         found = []
         for proposed in itertools.combinations([joint for joint in free if joint.name not in wanted], count):
             joints = tuple(joint for joint in free if joint not in proposed)
-            if config.joints and dict(zip(ARM_JOINTS, [joint.name for joint in joints], strict=False)).items() < config.joints.items():
+            played = dict(zip(ARM_JOINTS, [joint.name for joint in joints], strict=False))
+            if not config.joints.items() <= played.items():
                 continue
-            locked = _lock_angles(skeleton, hand, joints, proposed, {n: a for n, a in given.items() if skeleton.joints[n] in chain})
-            if locked is not None:
-                found.append(Roles(joints, locked, hand, tuple(joint.name for joint in proposed)))
+            held = {name: angle for name, angle in given.items() if skeleton.joints[name] in chain}
+            names = tuple(joint.name for joint in proposed)
+            found += [Roles(joints, locked, hand, names) for locked in _lock_angles(skeleton, hand, joints, proposed, held)]
         if found:
             yield from found
             return
@@ -198,14 +205,17 @@ def _readings(skeleton: Skeleton, hand: str, config: RobotConfig) -> Iterator[Ro
 
 def _lock_angles(
     skeleton: Skeleton, hand: str, joints: Sequence[Joint], proposed: Sequence[Joint], given: Mapping[str, float]
-) -> dict[str, float] | None:
-    """Angles of all locked joints with which ``joints`` are an arm of the class; None if there are none. The nearest to 0 go first."""
+) -> list[dict[str, float]]:
+    """Angles of all locked joints with which ``joints`` are an arm of the class, the nearest to 0 first; not more than a few."""
     choices = [_candidates(skeleton, joint, joints, given) for joint in proposed]
+    found: list[dict[str, float]] = []
     for angles in sorted(itertools.product(*choices), key=lambda each: sum(map(abs, each))):
         locked = {**given, **{joint.name: angle for joint, angle in zip(proposed, angles, strict=True)}}
         if is_of_class(skeleton, hand, joints, skeleton.frames(locked)):
-            return locked
-    return None
+            found.append(locked)
+        if len(found) == _MOST_ANGLES:
+            break
+    return found
 
 
 def _candidates(skeleton: Skeleton, lock: Joint, joints: Sequence[Joint], given: Mapping[str, float]) -> list[float]:
@@ -277,21 +287,18 @@ def _explain(skeleton: Skeleton, hands: Sequence[str], config: RobotConfig) -> N
         raise UnsupportedKinematics(
             path, f"there are not enough joints: {names or 'none'}; an arm needs a base yaw and three parallel pitches, and takes a roll"
         )
-    if any(joint.mimic for joint in chain):
-        raise UnsupportedKinematics(path, f"joint {next(joint.name for joint in chain if joint.mimic)!r} of the arm mimics another")
-    free = [joint for joint in chain if joint.name not in config.locked]
+    free = [joint for joint in chain if joint.name not in config.locked and joint.mimic is None]
     frames = skeleton.frames({name: math.radians(angle) for name, angle in config.locked.items()})
     yaw = skeleton.axis(free[0], frames)
     square = [joint for joint in free[1:] if abs(float(yaw @ skeleton.axis(joint, frames))) < PARALLEL_RAD]
     axes = [skeleton.axis(joint, frames) for joint in square]
     groups = [[o.name for o, a in zip(square, axes, strict=True) if np.linalg.norm(np.cross(a, axis)) < PARALLEL_RAD] for axis in axes]
     pitches = max(groups, key=len, default=[])
-    what = "no pitch" if not pitches else "no wrist pitch" if len(pitches) < 3 else "joints between or beyond them"
-    raise UnsupportedKinematics(
-        path,
-        f"there is {what}: of {names}, {len(pitches)} are parallel pitches square to the base yaw ({listed(pitches, 60) or 'none'}); "
-        f"three are needed, with the others locked",
-    )
+    if len(pitches) >= 3 and any(joint.mimic for joint in chain):
+        raise UnsupportedKinematics(path, f"joint {next(joint.name for joint in chain if joint.mimic)!r} of the arm mimics another")
+    what = "no pitch" if not pitches else "no wrist pitch" if len(pitches) < 3 else "no posture of the others in which these suffice"
+    found = f"{len(pitches)} of {names} are parallel pitches square to the base yaw ({listed(pitches, 60) or 'none'})"
+    raise UnsupportedKinematics(path, f"there is {what}: {found}; three are needed, and the others locked")
 
 
 def joint_range(joint: Joint, sign: int, offset_rad: float) -> tuple[float, float]:

@@ -478,7 +478,7 @@ def _limits(path: Path, element: ET.Element, where: str, kind: str) -> tuple[flo
         (-math.pi, math.pi) if kind == "continuous" else (scale * _scalar(path, limit, key, about, 0.0) for key in ("lower", "upper"))
     )
     effort, velocity = _scalar(path, limit, "effort", about), scale * _scalar(path, limit, "velocity", about)
-    if lower > upper:
+    if lower > upper and element.find("mimic") is None:  # what mimics another has its limits from that one
         _fail(path, f"{where} has a lower limit above its upper limit")
     for what, value in (("effort", effort), ("velocity", velocity)):
         if value < 0:
