@@ -239,7 +239,8 @@ class OutOfReach(HandoverError):
     def __init__(self, what: str, position_mm: tuple[float, float], rings_mm: Mapping[str, tuple[float, float]]) -> None:
         self.what, self.position_mm, self.rings_mm = what, position_mm, dict(rings_mm)
         alike = len(set(self.rings_mm.values())) == 1
-        rings = {"a base": next(iter(self.rings_mm.values()))} if alike else {f"that of {name!r}": ring for name, ring in rings_mm.items()}
+        ring = next(iter(self.rings_mm.values()))
+        rings = {"a base": ring} if alike else {f"the base of {name!r}": ring for name, ring in rings_mm.items()}
         allowed = " or ".join(f"{low:g} to {high:g} mm from {base}" for base, (low, high) in rings.items())
         super().__init__(
             f"{what} ({position_mm[0]:g}, {position_mm[1]:g}) mm is out of every arm's reach; "

@@ -144,6 +144,8 @@ def _automatic_distance_mm(config: CellConfig, names: Sequence[str], robots: Seq
         except (NoSharedSpace, InvalidSetting):
             continue
         return float(distance)
+    if config.chart == "paper" and one != other:
+        _ = SharedSpace(first, second, 1.0, config.chart).chart  # says what that chart needs
     rings = " and ".join(f"{name} {fits[robot].r_min_mm:g} to {fits[robot].r_max_mm:g}" for name, robot in zip(names, robots, strict=True))
     reason = f"none works for these rings ({rings} mm); choose another cell.pick_height_mm or cell.pitch_deg, which change them"
     raise NoSharedSpace(nominal, one.r_min_mm, one.r_max_mm, reason)

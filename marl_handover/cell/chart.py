@@ -151,7 +151,7 @@ GAP = 1e-3
 """Between what two arcs have of alpha: one half of it belongs to the end of either, so that rounding does not change the arc."""
 
 _NARROW_MM = 1e-9
-_QUARTER = math.pi / 2
+_QUARTER, _STEEP = math.pi / 2, 1.4
 
 Eta = tuple[float, float]
 
@@ -201,6 +201,13 @@ class AngleChart:
 
     def to_table(self, alpha: Array, beta: Array) -> Array:
         """Position (..., 2) in mm, in the chart's frame, of coordinates that are each of shape (...)."""
+        xp = namespace(alpha)
+        if alpha.dtype == xp.float32 and self._is_steep:
+            place = self._on_table(*(part * xp.ones_like(part, dtype=xp.float64) for part in (alpha, beta)))
+            return place.astype(alpha.dtype) if xp is np else place.to(alpha.dtype)
+        return self._on_table(alpha, beta)
+
+    def _on_table(self, alpha: Array, beta: Array) -> Array:
         xp, arcs = namespace(alpha), self._eta_arcs
         if len(arcs) == 1:
             return self._place(arcs[0][0] + alpha * (self.inset * arcs[0][1]), beta)
@@ -294,6 +301,12 @@ class AngleChart:
         there = (self._distance_mm * xp.sin(phi) - sum(self._lateral_mm) * xp.cos(h)) / sin_h
         least = (sin_h > 0) == (at_most == (arm == 0))
         return xp.where(least, xp.maximum(low, there), low), xp.where(least, high, xp.minimum(high, there))
+
+    @cached_property
+    def _is_steep(self) -> bool:
+        """Whether places are so near to a quarter turn off the base line that single precision would put them beside the ring."""
+        alpha, beta = np.meshgrid(np.linspace(-1, 1, 201), np.linspace(-1, 1, 5))
+        return any(bool((abs(turn) > _STEEP).any()) for _, turn in self._seen(self._on_table(alpha, beta)))
 
     @cached_property
     def _stretch(self) -> float:
