@@ -21,7 +21,7 @@ from marl_handover.geometry.urdf import ARM_JOINTS, Joint
 
 PARALLEL_RAD = 1e-3
 """Axes that differ by less are parallel: files round their angles."""
-MOST_LOCKS = 3
+MOST_LOCKS, MOST_MOVING = 2, 60
 _MOST_ANGLES = 4
 _TURNS_RAD = 3.5
 """A hinge that turns farther moves no finger."""
@@ -56,6 +56,9 @@ def find_roles(skeleton: Skeleton, config: RobotConfig) -> list[Roles]:
         UnsupportedKinematics: no way; it says what is missing.
         UnknownChoice: a setting names a joint or link that is not there.
     """
+    if len(skeleton.above) > MOST_MOVING:
+        what = f"it has {len(skeleton.above)} moving joints; an arm and its hand may have {MOST_MOVING}: cut them out of the rest"
+        raise UrdfError(skeleton.tree.path, what)
     _require_known(skeleton, config)
     hands = [_hand_of_tip(skeleton, config)] if config.tip or _named_gripper(config) else list(_bodies(skeleton, config))
     ranked = []
@@ -193,7 +196,7 @@ def _readings(skeleton: Skeleton, hand: str, config: RobotConfig) -> Iterator[Ro
         for proposed in itertools.combinations([joint for joint in free if joint.name not in wanted], count):
             joints = tuple(joint for joint in free if joint not in proposed)
             played = dict(zip(ARM_JOINTS, [joint.name for joint in joints], strict=False))
-            if not config.joints.items() <= played.items():
+            if not config.joints.items() <= played.items() or not _may_be(skeleton, chain, joints):
                 continue
             held = {name: angle for name, angle in given.items() if skeleton.joints[name] in chain}
             names = tuple(joint.name for joint in proposed)
@@ -203,15 +206,30 @@ def _readings(skeleton: Skeleton, hand: str, config: RobotConfig) -> Iterator[Ro
             return
 
 
+def _may_be(skeleton: Skeleton, chain: Sequence[Joint], joints: Sequence[Joint]) -> bool:
+    """Whether roles that follow each other without a lock between them have axes as they should: no lock changes those."""
+    frames = skeleton.frames({}, skeleton.way_to(joints[-1].child))
+    places = {joint.name: index for index, joint in enumerate(chain)}
+    for index, (one, other) in enumerate(itertools.pairwise(joints)):
+        if places[other.name] == places[one.name] + 1:
+            axes = skeleton.axis(one, frames), skeleton.axis(other, frames)
+            parallel = index in (1, 2)
+            off = float(np.linalg.norm(np.cross(axes[0], axes[1]))) if parallel else abs(float(axes[0] @ axes[1]))
+            if off > PARALLEL_RAD:
+                return False
+    return True
+
+
 def _lock_angles(
     skeleton: Skeleton, hand: str, joints: Sequence[Joint], proposed: Sequence[Joint], given: Mapping[str, float]
 ) -> list[dict[str, float]]:
     """Angles of all locked joints with which ``joints`` are an arm of the class, the nearest to 0 first; not more than a few."""
     choices = [_candidates(skeleton, joint, joints, given) for joint in proposed]
+    way = skeleton.way_to(hand)
     found: list[dict[str, float]] = []
     for angles in sorted(itertools.product(*choices), key=lambda each: sum(map(abs, each))):
         locked = {**given, **{joint.name: angle for joint, angle in zip(proposed, angles, strict=True)}}
-        if is_of_class(skeleton, hand, joints, skeleton.frames(locked)):
+        if is_of_class(skeleton, hand, joints, skeleton.frames(locked, way)):
             found.append(locked)
         if len(found) == _MOST_ANGLES:
             break

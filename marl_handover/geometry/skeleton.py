@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -62,10 +62,22 @@ class Skeleton:
             return values.get(joint.name, 0.0)
         return joint.mimic.multiplier * self.value(self.joints[joint.mimic.joint], values) + joint.mimic.offset
 
-    def frames(self, values: Mapping[str, float]) -> dict[str, Floats]:
-        """Link -> T_root_link (4, 4) in mm with moving joints at ``values``, rad or mm."""
+    def way_to(self, body: str) -> frozenset[str]:
+        """The links on the way from the root to a body, its own, and those that its joints move."""
+        links = {*self.members[body], *(joint.child for joint in self.moving[body])}
+        carrying = {joint.child: joint.parent for joint in self.tree.joints}
+        for link in tuple(links):
+            while link in carrying and carrying[link] not in links:
+                link = carrying[link]
+                links.add(link)
+        return frozenset(links)
+
+    def frames(self, values: Mapping[str, float], only: Collection[str] | None = None) -> dict[str, Floats]:
+        """Link -> T_root_link (4, 4) in mm with moving joints at ``values``, rad or mm; of the links in ``only``, if it is given."""
         frames: dict[str, Floats] = {self.tree.root: np.eye(4)}
         for joint in self.tree.joints:
+            if only is not None and joint.child not in only:
+                continue
             T = frames[joint.parent] @ self._origins[joint.name]
             if joint.kind == "prismatic":
                 T = T @ transform([self.value(joint, values) * part for part in joint.axis], (0.0, 0.0, 0.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -340,3 +341,33 @@ def test_the_gripper_knows_how_far_it_is_open() -> None:
             assert kind.gripper_mm([values[name] for name in kind.joints]) == pytest.approx(opening_mm)
     assert jaw.joint_values(5.0)["hinge"] == pytest.approx(-0.2 + 2 * math.asin(10.0 / 140.0))
     assert Gripper().joint_values(5.0) == {}
+
+
+def many_arms(arms: int, joints: int, bars: int) -> str:
+    """Chains of joints that turn about all axes, with fixed links on each: a file that takes its time."""
+    links, parts = ['<link name="base"/>'], []
+    for arm in range(arms):
+        parent = "base"
+        for index in range(joints):
+            child = f"l{arm}_{index}"
+            links.append(f'<link name="{child}"/>')
+            axis = ("0 0 1", "0 1 0", "1 0 0")[index % 3]
+            parts.append(
+                f'<joint name="j{arm}_{index}" type="continuous"><parent link="{parent}"/><child link="{child}"/><axis xyz="{axis}"/>'
+                f'<origin xyz="0.1 0.0{index} 0"/></joint>'
+            )
+            parent = child
+            for bar in range(bars):
+                links.append(f'<link name="{child}_{bar}"/>')
+                parts.append(f'<joint name="{child}_{bar}" type="fixed"><parent link="{child}"/><child link="{child}_{bar}"/></joint>')
+    return f"<robot name='many'>{''.join(links)}{''.join(parts)}</robot>"
+
+
+@pytest.mark.parametrize(("arms", "joints", "bars"), [(1, 400, 0), (8, 7, 7), (7, 8, 7)])
+def test_a_file_of_many_joints_is_answered_soon(tmp_path: Path, arms: int, joints: int, bars: int) -> None:
+    path = tmp_path / "many.urdf"
+    path.write_text(many_arms(arms, joints, bars))
+    started = time.perf_counter()
+    with pytest.raises((UrdfError, UnsupportedKinematics)):
+        read(path)
+    assert time.perf_counter() - started < 20.0
