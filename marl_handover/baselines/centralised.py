@@ -23,7 +23,7 @@ from marl_handover.config import CentralisedConfig, TaskConfig
 from marl_handover.envs.centralised import CentralisedRules
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.algorithm import Algorithm, compiled, stepped
-from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, averaging, unpacked
+from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, unpacked
 from marl_handover.learning.networks import LOG_STD_RANGE, AfterstateCritic, HybridActor, arm_blocks, chosen_action, mlp, squashed_sample
 from marl_handover.learning.replay import HindsightReplayBuffer
 from marl_handover.learning.settings import SacConfig, TrainConfig
@@ -243,14 +243,9 @@ class CentralisedSac(HybridSac):
         target.requires_grad_(False).load_state_dict(critic.state_dict())
         start = [own.initial_temperature, own.initial_temperature, self.centralised.motion_temperature]
         self.loss = CentralisedSacLoss(Rules(rules.cell, rules.config), actor, critic, target, own, start).to(self.device)
-        adam: dict[str, Any] = {"lr": own.learning_rate, "fused": True}
-        self.actor_optimizer = torch.optim.Adam(actor.parameters(), **adam)
-        self.critic_optimizer = torch.optim.Adam(critic.parameters(), **adam)
-        self.temperature_optimizer = torch.optim.Adam([self.loss.log_temperatures], lr=own.temperature_rate)
-        self.average = averaging(self.trained())
+        self._optimise(actor, critic, [self.loss.log_temperatures])
         self._critic_loss = compiled(self.loss.critic_loss, config.compile)
         self._actor_loss = compiled(self.loss.motion_actor_loss, config.compile)
-        self.targets = self._targets(0.0)
         self.motion_target = self._motion_target(0.0)
 
     def schedule(self, fraction: float) -> None:

@@ -27,7 +27,7 @@ from marl_handover.envs.decentralised import DecentralisedEnv, TurnRules, own_vi
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.algorithm import Algorithm, compiled, stepped
 from marl_handover.learning.collector import BatchedCollector, Collector
-from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, SoftValue, averaging
+from marl_handover.learning.hybrid_sac import HybridSac, HybridSacLoss, SoftValue
 from marl_handover.learning.networks import (
     LOG_STD_RANGE,
     ActionDistribution,
@@ -269,15 +269,10 @@ class DecentralisedSac(HybridSac):
         arms = rules.cell.num_arms if self.learners == "independent" else 1
         self.losses = nn.ModuleList([self._learner(rules) for _ in range(arms)]).to(self.device)
         parts = [loss for loss in self.losses if isinstance(loss, TurnSacLoss)]
-        adam: dict[str, Any] = {"lr": self.config.learning_rate, "fused": True}
         self.actors = nn.ModuleList([loss.actor for loss in parts])
-        self.average = averaging(self.actors)
         self.critics = nn.ModuleList([loss.critic for loss in parts])
-        self.actor_optimizer = torch.optim.Adam(self.actors.parameters(), **adam)
-        self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), **adam)
-        self.temperature_optimizer = torch.optim.Adam([loss.log_temperatures for loss in parts], lr=self.config.temperature_rate)
+        self._optimise(self.actors, self.critics, [loss.log_temperatures for loss in parts])
         self.parts = [(loss, compiled(loss.critic_loss, config.compile), compiled(loss.actor_loss, config.compile)) for loss in parts]
-        self.targets = self._targets(0.0)
 
     def _learner(self, rules: TurnRules) -> TurnSacLoss:
         own, seen = self.config, 2 if self.learners == "ctde" else 1

@@ -198,13 +198,17 @@ class HybridSac(Algorithm):
         target = AfterstateCritic(own.critic_hidden, own.final_hidden, self.folds, own.harmonics).to(self.device).requires_grad_(False)
         target.load_state_dict(critic.state_dict())
         self.loss = HybridSacLoss(rules, actor, critic, target, own).to(self.device)
-        adam: dict[str, Any] = {"lr": own.learning_rate, "fused": True}
-        self.actor_optimizer = torch.optim.Adam(actor.parameters(), **adam)
-        self.critic_optimizer = torch.optim.Adam(critic.parameters(), **adam)
-        self.temperature_optimizer = torch.optim.Adam([self.loss.log_temperatures], lr=own.temperature_rate)
-        self.average = averaging(self.trained())
+        self._optimise(actor, critic, [self.loss.log_temperatures])
         self._critic_loss = compiled(self.loss.critic_loss, config.compile)
         self._actor_loss = compiled(self.loss.actor_loss, config.compile)
+
+    def _optimise(self, actor: nn.Module, critic: nn.Module, temperatures: list[nn.Parameter]) -> None:
+        """Make the optimisers of all three, the actor's average, and the first target entropies."""
+        rate = self.config.learning_rate
+        self.actor_optimizer = torch.optim.Adam(actor.parameters(), lr=rate, fused=True)
+        self.critic_optimizer = torch.optim.Adam(critic.parameters(), lr=rate, fused=True)
+        self.temperature_optimizer = torch.optim.Adam(temperatures, lr=self.config.temperature_rate)
+        self.average = averaging(actor)
         self.targets = self._targets(0.0)
 
     @property
