@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
+from cases import PUBLIC, RINGS_MM, SMALL
 
 from marl_handover import cli
 from marl_handover.cell import build_cell
@@ -14,7 +12,6 @@ from marl_handover.config import BlockConfig, CellConfig
 from marl_handover.errors import HandoverError
 from marl_handover.motion.planner import MotionPlanner
 
-CASES = Path(os.environ.get("MARL_CASES", Path(__file__).resolve().parents[3] / "shared" / "cases")) / "urdf"
 LIMITS = {
     "base_yaw": [-120.0, 120.0],
     "shoulder": [-34.4, 177.6],
@@ -22,11 +19,11 @@ LIMITS = {
     "wrist_pitch": [-120.3, 97.4],
     "wrist_roll": [-177.0, 177.0],
 }
-pytestmark = pytest.mark.skipif(not CASES.is_dir(), reason="the cases are not here")
+pytestmark = pytest.mark.skipif(not SMALL.is_dir(), reason="the cases are not here")
 
 
 def cell_of(name, **settings):
-    return build_cell(CellConfig(robot=str(CASES / f"{name}.urdf"), base_distance_mm=460.0, joint_limits_deg=LIMITS, **settings))
+    return build_cell(CellConfig(robot=str(SMALL / f"{name}.urdf"), base_distance_mm=460.0, joint_limits_deg=LIMITS, **settings))
 
 
 def require_motions(model, count):
@@ -57,7 +54,7 @@ def test_capsules_along_the_links_stand_in_for_what_is_not_there(name):
 @pytest.mark.parametrize(("name", "said"), [("mesh", "forearm.stl"), ("no_collision", "no link has a collision shape")])
 def test_what_is_missing_is_one_line_with_the_fix(name, said, capsys, tmp_path):
     limits = ",".join(f"{joint}:[{low},{high}]" for joint, (low, high) in LIMITS.items())
-    keys = [f"robot={CASES / name}.urdf", "cell.base_distance_mm=460", f"cell.joint_limits_deg={{{limits}}}"]
+    keys = [f"robot={SMALL / name}.urdf", "cell.base_distance_mm=460", f"cell.joint_limits_deg={{{limits}}}"]
     assert cli.main(["plan", *keys, "start=[-150,-60,0]", "goal=[150,60,90]", f"motion={tmp_path / 'motion.json'}"]) == 2
     line = capsys.readouterr().err.strip()
     assert said in line
@@ -66,22 +63,13 @@ def test_what_is_missing_is_one_line_with_the_fix(name, said, capsys, tmp_path):
     assert len(line) <= 300
 
 
-PUBLIC = {
-    "so101": (60.0, 269.0, 434.0),
-    "so100": (60.0, 240.0, 432.0),
-    "px100": (60.0, 180.0, 316.0),
-    "wx250": (80.0, 252.0, 662.0),
-    "open_manipulator_x": (45.0, 183.0, 379.0),
-}
-"""Pick height, and the level hand's ring there by joint limits alone, by kinematics that know nothing of this package."""
-
-
-@pytest.mark.parametrize("name", PUBLIC)
+# The published ring of the Lite 6 begins 16 mm farther out than what its joint limits give here, whatever the shapes.
+@pytest.mark.parametrize("name", sorted(set(RINGS_MM) - {"lite6"}))
 def test_public_robots_without_their_meshes_reach_their_rings(name):
-    path = CASES.parent / "urdf-public" / f"{name}.urdf"
+    path = PUBLIC / f"{name}.urdf"
     if not path.is_file():
         pytest.skip("the public files are not here")
-    height, low, high = PUBLIC[name]
+    height, low, high = RINGS_MM[name]
     block = BlockConfig(pin_top_mm=height + 20.0)
     distance = 10.0 * round(0.156 * high)
     model = build_cell(CellConfig(robot=str(path), shapes="links", pick_height_mm=height, base_distance_mm=distance, block=block))

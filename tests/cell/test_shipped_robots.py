@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-import os
+import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from cases import PUBLIC
 
-from marl_handover.cell import build_cell, cell_config
+from marl_handover import cli
+from marl_handover.cell import build_cell, cell_config, load_cell
 from marl_handover.cell.reach import bound_by
+from marl_handover.config import TaskConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.files import resource_path
 from marl_handover.geometry.robot import read_robot, robot_config
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.planner import MotionPlanner
+from marl_handover.task.planner import ExactPlanner
+from marl_handover.task.problems import sample_problems
+from marl_handover.task.rules import Rules
 
-CASES = Path(os.environ.get("MARL_CASES", Path(__file__).resolve().parents[3] / "shared" / "cases"))
 ROBOTS = ("so101", "px100")
 RINGS = {"so101": (150.0, 230.0), "so101_wide": (120.0, 348.0), "px100": (180.0, 316.0)}
 """Of the cells: the paper's; nearly what the joint limits allow at this pick pitch; what they allow, 60 mm over the table."""
@@ -68,7 +73,7 @@ def test_forward_kinematics_are_those_of_pybullet(name):
 @pytest.mark.parametrize(("name", "public", "tolerance_mm"), [("so101", "so101", 0.3), ("px100", "px100", 0.05)])
 def test_lengths_are_those_of_the_public_file(name, public, tolerance_mm):
     """To the rounding of the numbers that were read off, and the 0.18 mm by which the public SO-101's roll axis is beside the plane."""
-    path = CASES / "urdf-public" / f"{public}.urdf"
+    path = PUBLIC / f"{public}.urdf"
     if not path.is_file():
         pytest.skip("the public files are not here")
     own = read_robot(robot_config(name))
@@ -132,3 +137,20 @@ def test_every_place_can_be_picked_from(model):
         place = base.around(generator.uniform(fit.r_min_mm, fit.r_max_mm), generator.uniform(0.1, 1.0))
         motion = planner.plan_paths(arm, pick, place, planner.homes_rad[arm], planner.homes_rad[1 - arm])
         assert motion.min_clearance_mm >= planner.motion.arm_clearance_mm - 1e-6
+
+
+@pytest.mark.parametrize(("name", "fewest"), [("so101", 2.95), ("so101_wide", 2.99)])
+def test_problems_are_as_hard_as_those_of_the_paper(name, fewest):
+    """Mean fewest transfers at 5 degrees, against a computation that knows nothing of this package."""
+    rules = Rules(load_cell(name), TaskConfig(epsilon_deg=5.0))
+    start, goal = sample_problems(rules.cell, 20_000, torch.Generator().manual_seed(0))
+    assert ExactPlanner(rules).plan(start.numpy(), goal.numpy()).transfers.mean() == pytest.approx(fewest, abs=0.04)
+
+
+def test_the_shipped_policy_fits_the_so101_as_it_is(capsys, tmp_path):
+    """The rings are those of the paper, so the problem is, too."""
+    out = tmp_path / "table.json"
+    assert cli.main(["evaluate", "policy=pretrained_b", "cell=so101", "episodes=1000", f"json={out}", "progress=false"]) == 0
+    table = json.loads(out.read_text())
+    assert table["success_rate"] >= 0.99
+    assert table["steps_ratio"] <= 1.02
