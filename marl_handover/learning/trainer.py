@@ -22,9 +22,8 @@ from marl_handover.files import remove_temporaries, write_whole
 from marl_handover.learning.algorithm import OwnTorch, compile_state, subnormals_flushed
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
 from marl_handover.learning.collector import Collected
-from marl_handover.learning.curriculum import Curriculum
 from marl_handover.learning.recorder import Recorder, check_finite, machine
-from marl_handover.learning.settings import OffPolicyConfig, OnPolicyConfig, TrainConfig
+from marl_handover.learning.settings import Curriculum, OffPolicyConfig, OnPolicyConfig, TrainConfig
 from marl_handover.learning.variant import make_variant
 from marl_handover.locks import claimed
 from marl_handover.parsing import parse_yaml

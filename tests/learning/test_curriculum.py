@@ -8,8 +8,7 @@ import pytest
 
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.errors import InvalidSetting
-from marl_handover.learning.curriculum import Curriculum
-from marl_handover.learning.settings import StageConfig
+from marl_handover.learning.settings import Curriculum, StageConfig
 from marl_handover.learning.trainer import Trainer
 
 
