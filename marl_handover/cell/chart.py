@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
 
 from marl_handover.arrays import Array, namespace, wrap
 from marl_handover.cell.arm import REACH_TOLERANCE_MM, Arm
@@ -389,6 +388,8 @@ class AngleChart:
     @cached_property
     def _eta_arcs(self) -> tuple[Eta, ...]:
         """Centre and half of the width of each interval of eta on which there are places."""
+        from scipy.optimize import brentq, minimize_scalar  # here: the paper's chart needs neither, and they take their time to load
+
         eta = self._sampled
         width = self._width_mm(eta)
         for index in np.flatnonzero((width[1:-1] <= 0) & (width[1:-1] > width[:-2]) & (width[1:-1] >= width[2:])) + 1:
