@@ -186,7 +186,9 @@ class AngleChart:
     def __post_init__(self) -> None:
         self._require_ahead()
         if not self._eta_arcs:
-            raise self._none(f"{self._reach}; they have no place in common")
+            most = self.first.r_max_mm + self.second.r_max_mm
+            fix = f"stand them less than {most:g} mm apart" if most <= self._distance_mm else "turn them to face each other"
+            raise self._none(f"{self._reach}; they have no place in common: {fix}")
 
     @property
     def arcs(self) -> tuple[Arc, ...]:
