@@ -51,7 +51,7 @@ class SimulateCommand:
     cell: CellConfig | None = None  # single keys change the paper cell
     task: TaskChanges = field(default_factory=TaskChanges)  # but for the noise: physics decides
     motion: MotionConfig = field(default_factory=MotionConfig)
-    grasp: str = chosen("friction", ("friction", "constraint"))  # of two pads; constraint: a rigid joint while both are on the pin
+    grasp: str | None = chosen(None, ("friction", "constraint"))  # of two pads; constraint: a rigid joint while both are on the pin
     video: str = path_field()  # .mp4 or .gif
     fps: float = bounded(12.5, 1.0, 50.0)  # of the video, in simulated time
     size: list[int] = bounded([640, 480], 16, 4096, (2, 2))  # of the video: width, height in pixels

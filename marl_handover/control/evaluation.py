@@ -55,7 +55,7 @@ class AssessmentConfig:
     seed: int = seed_field()  # of the problems, and of execution noise but for the twin, whose servos go on as they are
     cell: CellConfig | None = None  # single keys change the paper cell
     task: TaskChanges = field(default_factory=TaskChanges)  # task.noise left out: of noisy, 1 mm and 0.5 deg
-    grasp: str | None = chosen(None, ("friction", "constraint"))  # of bullet: friction or constraint; null: friction
+    grasp: str | None = chosen(None, ("friction", "constraint"))  # of bullet: friction or constraint; null: friction where that holds
     missed_grasps: float | None = bounded(None, 0.0, 1.0)  # of noisy: probability that the fingers close on nothing; null: 0.01
     loop: LoopConfig = field(default_factory=LoopConfig)  # of all but kinematic
     motion: MotionConfig = field(default_factory=MotionConfig)  # of all but kinematic

@@ -36,11 +36,12 @@ class _Servo(NamedTuple):
     velocity: float
 
 
-def grips_by_friction(description: ArmDescription) -> bool:
-    """Whether a hand has two sliding pads with shapes, between which friction can hold a pin; other hands need a rigid joint."""
+def grips_by_friction(description: ArmDescription, *, hinged: bool = False) -> bool:
+    """Whether a hand has two sliding pads with shapes, between which friction holds a pin; ``hinged``: or a jaw, whose pads tilt."""
     shaped = {link.name for link in description.links if link.collisions}
     fingers = [joint.child for joint in description.joints if joint.name in description.gripper.joints]
-    return description.gripper.kind == "fingers" and len(fingers) > 1 and shaped.issuperset(fingers)
+    kind = description.gripper.kind
+    return bool(fingers) and shaped.issuperset(fingers) and (len(fingers) > 1 if kind == "fingers" else hinged and kind == "jaw")
 
 
 class SimulatedArm:

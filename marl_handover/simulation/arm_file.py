@@ -30,7 +30,7 @@ def whole(description: ArmDescription) -> ArmDescription:
     for link in description.links:
         inertial, made_up = _inertial(link)
         links.append(replace(link, inertial=inertial))
-        if made_up and inertial.mass_kg > LEAST_KG:
+        if made_up and inertial.mass_kg > LEAST_KG and link.name != description.root:
             assumed.append(f"{link.name} {1e3 * inertial.mass_kg:.0f} g")
     if not assumed:
         return replace(description, links=tuple(links))

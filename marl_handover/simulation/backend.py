@@ -33,7 +33,7 @@ class BulletBackend:
     Args:
         model: the cell.
         motion: degree, limits and times of the motion.
-        grasp: "friction" or "constraint", as for :class:`BulletCell`.
+        grasp: "friction", "constraint" or None, as for :class:`BulletCell`.
         gui: open PyBullet's window.
         camera: what :meth:`render` looks through.
         size: width and height of its pictures.
@@ -46,7 +46,7 @@ class BulletBackend:
         model: CellModel,
         motion: MotionConfig,
         *,
-        grasp: str = "friction",
+        grasp: str | None = None,
         gui: bool = False,
         camera: Camera = TOP,
         size: tuple[int, int] = (_PICTURE_WIDTH, _PICTURE_HEIGHT),

@@ -179,6 +179,9 @@ def _mass_properties(config: BlockConfig) -> tuple[float, float, tuple[float, fl
 GRASPS = ("friction", "constraint")
 """How a pin is held: between two pads, or by a rigid joint. Hands without two sliding pads that have shapes always take the joint."""
 
+LEVER_MM = 42.0
+"""How far below the pads a block's centre may hang that friction holds; the solver lets a lower one creep while the hand turns."""
+
 NEAR_MM = 4.0
 """So near to the pin the grip of a hand without such pads has to be, for the block to stick to it."""
 
@@ -241,8 +244,9 @@ class BulletCell:
     Args:
         model: the cell.
         motion: where the arms park, and how far the fingers open.
-        grasp: "friction" (finger contact alone) or "constraint" (a rigid joint while both fingers are on the pin). The block sticks to a
-            hand without two pads, or whose pads have no shapes, in either case, and passes through it otherwise.
+        grasp: "friction" (finger contact alone) or "constraint" (a rigid joint while both fingers are on the pin); None: friction for a
+            block that hangs less than :data:`LEVER_MM` below two pads that slide. To a hand that has no pads, or none with shapes, and
+            to a hinged jaw unless friction is asked for, the block sticks, and passes through it otherwise.
         gui: open PyBullet's window.
 
     Attributes:
@@ -254,14 +258,17 @@ class BulletCell:
         NoWindow: if ``gui`` and there is no display.
     """
 
-    def __init__(self, model: CellModel, motion: MotionConfig, *, grasp: str = "friction", gui: bool = False) -> None:
-        require_choice("grasp", grasp, GRASPS)
+    def __init__(self, model: CellModel, motion: MotionConfig, *, grasp: str | None = None, gui: bool = False) -> None:
+        if grasp is not None:
+            require_choice("grasp", grasp, GRASPS)
         model.cell.require_grip(motion.finger_travel_mm)
-        self.model, self.motion, self.grasp = model, motion, grasp
+        self.model, self.motion = model, motion
         self.homes_rad = parked_poses(model, motion)
         require_effort(model, motion, self.homes_rad)
-        self.notes = _notes(model)
-        self._sticky = [not grips_by_friction(arm.description) for arm in model.arms]
+        levers_mm = np.asarray(model.cell.pick_heights_mm) - _mass_properties(model.cell.config.block)[1]
+        self._bonded = [bool(lever > LEVER_MM) if grasp is None else grasp == "constraint" for lever in levers_mm]
+        self._sticky = [not grips_by_friction(arm.description, hinged=grasp == "friction") for arm in model.arms]
+        self.notes = _notes(model, self._sticky, self._bonded if grasp is None else [False] * len(levers_mm))
         self.engine = Engine(gui)
         self.reset((0.0, 0.0, 0.0))
 
@@ -380,7 +387,7 @@ class BulletCell:
             report.grasped = self.held(arm)
             if report.grasped:
                 self._holding.add(arm)
-                if self.grasp == "constraint" or self._sticky[arm]:
+                if self._bonded[arm] or self._sticky[arm]:
                     self._bonds[arm] = self._bond(arm)
         elif step == track.opens_at:
             report.kept = self.held(arm)
@@ -431,14 +438,16 @@ class BulletCell:
             found[name] = min(real, key=lambda touch: touch.distance_mm)
 
 
-def _notes(model: CellModel) -> tuple[str, ...]:
+def _notes(model: CellModel, sticky: Sequence[bool], bonded: Sequence[bool]) -> tuple[str, ...]:
     """What is made up about the cell's robots, one line each."""
     notes = {}
-    for arm in model.arms:
+    for arm, sticks, stiff in zip(model.arms, sticky, bonded, strict=True):
         description = arm.description
         made_up = list(whole(description).assumed[len(description.assumed) :])
-        if not grips_by_friction(description):
+        if sticks:
             made_up.append("the block sticks to its hand: there are no two sliding pads with shapes")
+        elif stiff:
+            made_up.append("a rigid joint holds the pin once both pads are on it: the block hangs low (grasp=friction: pads alone)")
         notes[description.name] = f"physics of {description.name}: {'; '.join(made_up)}" if made_up else ""
     return tuple(filter(None, notes.values()))
 
