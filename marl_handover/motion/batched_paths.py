@@ -338,6 +338,9 @@ def ends_of(cell: Cell, arm: Tensor, from_mm: Tensor, to_mm: Tensor) -> Ends:
     """Both ends, world positions (n, 2) in mm, as the acting arms (n,) see them."""
     seen = [cell.polar(place) for place in (from_mm, to_mm)]
     square, yaw = (torch.stack([select(parts[which], arm) for parts in seen], -1) for which in range(2))
+    if any(each.lateral_mm for each in cell.arms):  # the cell counts base yaws; ends are where the places are seen
+        aside = square.new_tensor([each.lateral_mm for each in cell.arms])[arm][:, None]
+        yaw = yaw + torch.atan2(aside, (square - aside.square()).clamp_min(0.0).sqrt())
     return Ends(square.sqrt(), yaw)
 
 

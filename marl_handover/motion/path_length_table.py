@@ -267,7 +267,7 @@ def build_table(cell: Cell, motion: MotionConfig, arm: int = 0, *, progress: boo
 
 def _places(ring: Arm, middle_rad: float, first_mm: float, second_mm: float, between_rad: float) -> tuple[Floats, Floats]:
     """World positions (2,) of two places at these radii of an arm, symmetric about ``middle_rad`` of its yaw."""
-    first, second = ring.base.around((first_mm, second_mm), middle_rad + np.array([-0.5, 0.5]) * between_rad)
+    first, second = ring.at((first_mm, second_mm), middle_rad + np.array([-0.5, 0.5]) * between_rad)
     return first, second
 
 

@@ -36,7 +36,7 @@ def test_a_pose_is_found_that_is_clear_of_all_and_reached_from_everywhere(tmp_pa
     assert ground_clearance_mm(arm, pose) >= planner.motion.ground_clearance_mm
     for radius in (ring.r_min_mm, ring.r_max_mm):
         for yaw in 0.98 * np.linspace(*ring.yaw_rad, 5):
-            pin = ring.base.around(radius, yaw)
+            pin = ring.at(radius, yaw)
             for leaving in (False, True):
                 planner.reach(0, pose, pin, planner.others_home_rad(0), leaving=leaving)
 

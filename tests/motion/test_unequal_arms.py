@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from marl_handover.cell.build import build_cell
-from marl_handover.config import ArmConfig, CellConfig
+from marl_handover.config import ArmConfig, CellConfig, CentralisedConfig
 from marl_handover.envs.cycle_check import CycleCheck
 from marl_handover.errors import UnequalArms
+from marl_handover.motion.batched_paths import MotionNumbers, ends_of
 from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.motion.initial_guesses import proportions
 from marl_handover.motion.pick_place import timed_phases
@@ -34,7 +36,7 @@ def random_transfers(planner, arm, count, seed=0):
     ring, generator = planner.model.cell.arms[arm], np.random.default_rng(seed)
     for _ in range(count):
         radii, yaws = generator.uniform(ring.r_min_mm, ring.r_max_mm, 2), generator.uniform(*ring.yaw_rad, 2)
-        yield ring.base.around(radii, yaws)
+        yield ring.at(radii, yaws)
 
 
 def test_arms_of_one_robot_share_a_collision_model_and_others_do_not(mixed):
@@ -106,3 +108,14 @@ def test_an_arm_of_another_size_finds_its_paths(tmp_path, lengths: ArmLengths):
             np.testing.assert_allclose(arm_model.grip_mm(q), [*seen, 45.0], atol=0.05)
             turned = math.atan2(seen[1], seen[0]) - math.asin(lengths.lateral / math.hypot(*seen))
             assert q[0] == pytest.approx(turned, abs=2e-4)
+
+
+def test_batched_ends_of_grips_beside_the_plane_are_those_of_the_planner(tmp_path):
+    planner = MotionPlanner(build_cell(SO101.cell(tmp_path, grid_mm=10.0)))
+    model = planner.model
+    numbers = MotionNumbers(model, planner.motion, CentralisedConfig())
+    pick, place = next(random_transfers(planner, 1, 1))
+    ends = ends_of(model.cell, torch.tensor([1]), *(torch.tensor(end[None]) for end in (pick, place)))
+    expected = np.stack([planner.grasp_joints(1, "hold", end)[:4] for end in (pick, place)])
+    np.testing.assert_allclose(numbers.end_joints(ends)[0].numpy(), expected, atol=2e-4)
+    np.testing.assert_allclose(ends.places_mm[0].numpy(), [planner.in_base(1, end) for end in (pick, place)], atol=1e-3)

@@ -97,7 +97,7 @@ def carried_out(model, count, seed=3):
             arm = int(random.integers(2))
             ring = model.cell.arms[arm]
             radii, yaws = random.uniform(ring.r_min_mm, ring.r_max_mm, 2), 0.97 * random.uniform(*ring.yaw_rad, 2)
-            pick, place = ring.base.around(radii, yaws)
+            pick, place = ring.at(radii, yaws)
             backend.reset(np.array([*pick, 0.4]), 0)
             paths = planner.plan_paths(arm, pick, place, planner.homes_rad[arm], planner.others_home_rad(arm)).paths
             done = backend.execute(arm, paths)
