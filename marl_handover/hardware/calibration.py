@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from marl_handover.arrays import Floats
 from marl_handover.config import require_between, require_choice
-from marl_handover.errors import CorruptFile, HandoverError, MissingFile
+from marl_handover.errors import CorruptFile, HandoverError, MissingFile, UnsupportedKinematics
 from marl_handover.files import keep, make_folder, read_bounded, write_together, write_whole
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.urdf import ARM_JOINTS
@@ -226,7 +226,17 @@ def _stored(what: str, path: Path, version: int, again: str = "") -> Iterator[di
 
 
 def calibrations(config: HardwareConfig, model: ArmModel) -> tuple[ArmCalibration, ...]:
-    """The calibration of every arm: its file's, or the nominal one where the settings name none."""
+    """The calibration of every arm: its file's, or the nominal one where the settings name none.
+
+    Raises:
+        UnsupportedKinematics: the arm has other joints or another hand than the servos are wired for.
+    """
+    description = model.description
+    servos = [source.joint for source in description.sources]
+    if None in servos or description.gripper.kind != "fingers" or len(description.gripper.joints) != 2:
+        missing = "the joint wrist_roll" if None in servos else "a hand with two fingers that slide"
+        problem = f"hardware and twin have servos for five joints and two fingers, but this robot lacks {missing}; use backend=bullet"
+        raise UnsupportedKinematics(description.path, problem)
     return tuple(
         load_calibration(config.arms[arm].calibration, arm, model)
         if config.arms[arm].calibration

@@ -9,18 +9,20 @@ import numpy as np
 import pytest
 
 from marl_handover.control.settings import twin_workcell
-from marl_handover.errors import CorruptFile, MissingFile
+from marl_handover.errors import CorruptFile, MissingFile, UnsupportedKinematics
+from marl_handover.geometry.robot import read_robot, robot_config
 from marl_handover.hardware.calibration import (
     SERVO_FILES,
     SET_FILE,
     CalibrationProblem,
+    calibrations,
     load_backlash,
     load_calibration,
     nominal_calibration,
     require_one_set,
     save_servos,
 )
-from marl_handover.hardware.settings import ARMS
+from marl_handover.hardware.settings import ARMS, HardwareConfig
 
 
 @pytest.fixture
@@ -82,3 +84,9 @@ def test_a_missing_or_damaged_file_is_named(save):
             require_one_set(folder)
         (folder / "away").rename(folder / name)
     require_one_set(folder)
+
+
+@pytest.mark.parametrize(("robot", "lacks"), [("px100", "the joint wrist_roll"), ("so101", "a hand with two fingers that slide")])
+def test_a_robot_that_the_servos_are_not_wired_for_is_refused(robot, lacks):
+    with pytest.raises(UnsupportedKinematics, match=f"{robot}.urdf: .* this robot lacks {lacks}; use backend=bullet"):
+        calibrations(HardwareConfig(), read_robot(robot_config(robot)))
