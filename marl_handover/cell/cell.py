@@ -199,7 +199,7 @@ class Cell:
 
     def within(self, square_mm2: Array, yaw_rad: Array) -> Array:
         """Whether each arm's squared radius and base yaw, both (..., num_arms), lie in its annulus sector, to 1 um."""
-        low, high, yaw_low, yaw_high = self._constants(square_mm2)[5:9]
+        low, high, yaw_low, yaw_high = self._sector or self._constants(square_mm2)[5:9]
         return (square_mm2 >= low) & (square_mm2 <= high) & (yaw_rad >= yaw_low) & (yaw_rad <= yaw_high)
 
     def reaches(self, position_mm: Array) -> Array:
@@ -248,10 +248,7 @@ class Cell:
         if key not in self._kinds:
             rows = []
             for arm in self.arms:
-                low, high = arm.r_min_mm - REACH_TOLERANCE_MM, arm.r_max_mm + REACH_TOLERANCE_MM
-                slack = REACH_TOLERANCE_MM / arm.r_min_mm
-                sector = [low * low, high * high, arm.yaw_rad[0] - slack, arm.yaw_rad[1] + slack]
-                rows.append([arm.base.x_mm, arm.base.y_mm, *arm.base.facing, arm.base.facing_rad, *sector, arm.lateral_mm])
+                rows.append([arm.base.x_mm, arm.base.y_mm, *arm.base.facing, arm.base.facing_rad, *_sector(arm), arm.lateral_mm])
             table = np.array(rows, np.float64).T
             if isinstance(like, (np.ndarray, np.generic)):
                 self._kinds[key] = table.astype(like.dtype)
@@ -260,9 +257,22 @@ class Cell:
         return self._kinds[key]
 
     @cached_property
+    def _sector(self) -> tuple[float, float, float, float] | None:
+        """The limits of every arm's sector, if they are the same: comparing with numbers is quicker than with rows of them."""
+        sectors = {_sector(arm) for arm in self.arms}
+        return sectors.pop() if len(sectors) == 1 else None
+
+    @cached_property
     def _has_lateral(self) -> bool:
         return any(arm.lateral_mm for arm in self.arms)
 
     @cached_property
     def _kinds(self) -> dict[Any, Array]:
         return {}
+
+
+def _sector(arm: Arm) -> tuple[float, float, float, float]:
+    """Least and greatest squared radius [mm^2] and yaw [rad] of an arm's sector, tolerances included."""
+    low, high = arm.r_min_mm - REACH_TOLERANCE_MM, arm.r_max_mm + REACH_TOLERANCE_MM
+    slack = REACH_TOLERANCE_MM / arm.r_min_mm
+    return low * low, high * high, arm.yaw_rad[0] - slack, arm.yaw_rad[1] + slack
