@@ -106,7 +106,10 @@ def bound_by(arm: ArmModel, radius_mm: float, pick_height_mm: float, block: Bloc
 
 
 def require_grasps(arm: ArmModel, pick_height_mm: float, block: BlockConfig) -> None:
-    """Raise :class:`UrdfError`, which names two bodies, if the joints could take the grip to the table but shapes are always in the way."""
+    """Raise :class:`UrdfError`, which names two bodies, if the joints could take the grip to the table but shapes are always in the way.
+
+    Where the held block is one of them, :class:`InvalidSetting` on its size.
+    """
     points = np.stack([np.arange(1.0, arm.reach_mm), np.zeros(int(arm.reach_mm - 1e-9))], axis=-1)
     q, good = grasps(arm, points, pick_height_mm)
     margins = grasp_margins_mm(arm, q[good], MotionConfig(), block_capsules(block, pick_height_mm))
@@ -114,6 +117,9 @@ def require_grasps(arm: ArmModel, pick_height_mm: float, block: BlockConfig) -> 
         return
     (one, other), _ = max(margins.items(), key=lambda item: float(np.mean(item[1] < 0)))
     where = f"in every posture that holds the pin at pick_height_mm = {pick_height_mm:g}"
+    if "block" in (one, other):
+        limit = f"so small that {one!r} and {other!r} do not touch {where}"
+        raise InvalidSetting("cell.block.side_mm", block.side_mm, limit)
     what = f"{one!r} and {other!r} are too near to each other {where}; mend their shapes, or set shapes=links"
     raise UrdfError(arm.description.path, what)
 

@@ -223,11 +223,16 @@ def test_the_papers_method_by_name(tmp_path, capsys):
 
 
 def test_a_transfer_without_a_motion_is_one_line_and_nothing_is_written(tmp_path, capsys):
-    """A block so wide that it hits the arm that holds it."""
+    """A hand that holds the pin is nearer to the table than it may be."""
     names = {"motion": "m.json", "motion_picture": "m.png", "json": "p.json", "picture": "p.png"}
-    assert cli.main(["plan", "cell.block.side_mm=200", *(f"{key}={tmp_path / name}" for key, name in names.items())]) == 1
+    assert cli.main(["plan", "arm_motion.ground_clearance_mm=30", *(f"{key}={tmp_path / name}" for key, name in names.items())]) == 1
     assert capsys.readouterr().err.startswith("marl-handover plan: transfer 1, arm R, has no motion: the start pose is ")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_block_that_hits_the_arm_that_holds_it_is_too_wide(capsys):
+    assert cli.main(["plan", "cell.block.side_mm=200"]) == 2
+    assert "cell.block.side_mm = 200.0: must be so small that 'forearm' and 'block' do not touch" in capsys.readouterr().err
 
 
 def test_motions_are_planned_only_when_asked_for():
