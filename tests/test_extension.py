@@ -204,8 +204,13 @@ def test_collecting_workers_know_an_algorithm_too(write, tmp_path, collector):
 
 
 def test_what_a_parcel_holds_is_unpacked_where_its_plugins_are_known(write):
+    def boldness():
+        from marl_handover.learning.settings import ALGORITHMS  # the worker's own
+
+        return ALGORITHMS["bolder"](boldness=4.0).boldness
+
     with plugins.added([write("bolder.py", ALGORITHM)]):
-        parcel = plugins.Parcel(lambda: ALGORITHMS["bolder"](boldness=4.0).boldness)
+        parcel = plugins.Parcel(boldness)
     code = "import pickle, sys; print(pickle.load(sys.stdin.buffer)())"
     found = subprocess.run([sys.executable, "-c", code], input=pickle.dumps(parcel), capture_output=True)
     assert found.stdout.split() == [b"4.0"], found.stderr
