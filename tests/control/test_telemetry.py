@@ -24,11 +24,11 @@ from marl_handover.errors import InvalidSetting
 PATIENCE_S = 120.0
 VIEWER = """
 import sys, threading
-from marl_handover.control.telemetry_reader import Feed
+from marl_handover.control.telemetry_reader import TelemetryReader
 from marl_handover.viewer.live import LivePage
 from marl_handover.viewer.server import keep_updating, open_server
 with open_server(0, "live") as server:
-    page = LivePage(server, None, Feed(sys.argv[1]))
+    page = LivePage(server, None, TelemetryReader(sys.argv[1]))
     print("up", flush=True)
     keep_updating(lambda dt_s: page.update(), 20.0, threading.Event())
 """
