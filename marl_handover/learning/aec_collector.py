@@ -154,7 +154,7 @@ class WorkerPolicy(AecPolicy):
     def _commands(self, seen: TensorDictBase, turn: NDArray[np.bool_]) -> Tensor:
         if not torch.equal(self._obeyed, self.weights):
             self._obeyed = self.weights.detach().clone()
-            nn.utils.vector_to_parameters(self._obeyed, self._learner.actor().parameters())
+            nn.utils.vector_to_parameters(self._obeyed, self._learner.trained().parameters())
         mode, progress, *bounds = self.orders.tolist()
         if progress != self._learner.progress:
             self._learner.schedule(progress)
@@ -164,8 +164,9 @@ class WorkerPolicy(AecPolicy):
 
 
 def message(explore: Explore, epsilon_range_rad: tuple[float, float]) -> dict[str, Tensor]:
-    """What workers are told: ``weights`` of the learner's actor, and ``orders``: number of the method in :data:`METHODS`, how much of the
-    training is done, and epsilon's range.
+    """What workers are told: ``weights`` of the network that explores, and ``orders``.
+
+    Orders are the number of the method in :data:`METHODS`, how much of the training is done, and epsilon's range.
 
     Raises:
         TypeError: ``explore`` is none of these methods; other functions stay in the process they are in.
@@ -173,7 +174,7 @@ def message(explore: Explore, epsilon_range_rad: tuple[float, float]) -> dict[st
     learner, name = getattr(explore, "__self__", None), getattr(explore, "__name__", "")
     if not isinstance(learner, Algorithm) or name not in METHODS:
         raise TypeError(f"workers explore by an algorithm's {' or '.join(METHODS)}, not by {explore!r}")
-    weights = nn.utils.parameters_to_vector(learner.actor().parameters()).detach().cpu().clone()
+    weights = nn.utils.parameters_to_vector(learner.trained().parameters()).detach().cpu().clone()
     return {"weights": weights, "orders": torch.tensor([METHODS.index(name), learner.progress, *epsilon_range_rad])}
 
 

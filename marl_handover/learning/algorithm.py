@@ -148,6 +148,10 @@ class Algorithm(ABC):
     def actor(self) -> nn.Module:
         """The network that :meth:`act` evaluates."""
 
+    def trained(self) -> nn.Module:
+        """The network that :meth:`explore` evaluates. Here: the actor."""
+        return self.actor()
+
     def exported(self) -> list[list[nn.Linear]]:
         """The layers of the networks that a policy file holds. Here: of the actor."""
         return [[module for module in self.actor().modules() if isinstance(module, nn.Linear)]]
