@@ -88,6 +88,8 @@ POSE = (-1e6, 1e6, (3, 3), None, "numbers: x [mm], y [mm], orientation [deg]")
 """Bounds of a pose; what is out of reach is told by the cell."""
 EPSILON_DEG, MAX_STEPS, SYMMETRY_ORDER, TOLERANCE_MM = (1e-4, 180.0), (1, 1000), (1, 360), (1e-3, 100.0)
 """Bounds of settings that have a second home: in a task, and in what is put over a policy's own task."""
+PICK_HEIGHT_MM, PITCH_DEG = (0.1, 1000.0), (-90.0, 90.0)
+"""Bounds of a robot's settings, which a cell may override."""
 
 
 @dataclass
@@ -131,8 +133,8 @@ class RobotConfig:
     approach: str = chosen("", APPROACHES)  # where the hand points, in the tip's frame
     gripper: list[str] = sized(list, 0, 2)  # its joints; [none]: things stick to the tip
     joint_limits_deg: dict[str, list[float]] = bounded(dict, -360.0, 360.0, (0, 64), (2, 2))  # role -> limits in place of the URDF's
-    pitch_deg: float = bounded(0.0, -90.0, 90.0)  # of the hand where it picks and places: 0 level, -60 steeply down
-    pick_height_mm: float = bounded(45.0, 0.1, 1000.0)  # of the grip over the table
+    pitch_deg: float = bounded(0.0, *PITCH_DEG)  # of the hand where it picks and places: 0 level, -60 steeply down
+    pick_height_mm: float = bounded(45.0, *PICK_HEIGHT_MM)  # of the grip over the table
     parked_deg: list[float] | None = bounded(None, -360.0, 360.0, (5, 5))  # joints by role while another arm moves; null: found
     shapes: str = chosen("file", SHAPES)  # file: the URDF's; links: capsules along the links; none
 
@@ -164,8 +166,8 @@ class CellConfig:
     arms: list[ArmConfig] = sized(list, 0, 16)  # one entry an arm; empty, or two that are not placed: face to face, base_distance_mm apart
     base_distance_mm: float | None = bounded(None, 10.0, 10_000.0)  # null: 0.78 of the sum of the outer radii, if that gives a shared space
     grasp_link: str = ""  # the robots' tip
-    pick_height_mm: float | None = bounded(None, 0.1, 1000.0)
-    pitch_deg: float | None = bounded(None, -90.0, 90.0)
+    pick_height_mm: float | None = bounded(None, *PICK_HEIGHT_MM)
+    pitch_deg: float | None = bounded(None, *PITCH_DEG)
     joint_limits_deg: dict[str, list[float]] = bounded(dict, -360.0, 360.0, (0, 64), (2, 2))  # joint by joint
     shapes: str | None = chosen(None, SHAPES)
     grid_mm: float = bounded(5.0, 1.0, 200.0)

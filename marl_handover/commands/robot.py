@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from marl_handover.cell.reach import bound_by, feasible
-from marl_handover.config import SHAPES, BlockConfig, RobotConfig, bounded, check_bounds, chosen, path_field
+from marl_handover.config import PICK_HEIGHT_MM, PITCH_DEG, SHAPES, BlockConfig, RobotConfig, bounded, check_bounds, chosen, path_field
 from marl_handover.errors import MissingExtra, MissingFile
 from marl_handover.geometry.canonical import require_moving
 from marl_handover.geometry.closed_form import ClosedFormArm
@@ -26,8 +26,8 @@ class RobotCommandConfig:
 
     robot: str = path_field("al5a")  # a URDF, a robot's YAML file, or the name of a shipped one
     tip: str = ""  # link in whose origin things are held
-    pick_height_mm: float | None = bounded(None, 0.1, 1000.0)
-    pitch_deg: float | None = bounded(None, -90.0, 90.0)  # of the hand where it picks and places
+    pick_height_mm: float | None = bounded(None, *PICK_HEIGHT_MM)
+    pitch_deg: float | None = bounded(None, *PITCH_DEG)  # of the hand where it picks and places
     shapes: str | None = chosen(None, SHAPES)  # file, links or none; null: the robot's own, or none where its meshes are missing
     json: str = path_field()  # file for what is printed
     out: str = path_field()  # folder for robot.json and robot.png, a picture of the arm and its ring

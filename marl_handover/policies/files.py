@@ -38,7 +38,9 @@ Layers = list[tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 def stored_settings(about: Mapping[str, Any]) -> tuple[CellConfig, TaskConfig]:
     """The cell and the task a policy file was trained with."""
-    task, _ = dict(about["task"]), about["cell"]["block"]  # a stored cell is whole: what it lacks is not for defaults to fill
+    if "block" not in about["cell"]:  # a stored cell is whole: what it lacks is not for defaults to fill
+        raise KeyError("cell.block")
+    task = dict(about["task"])
     task["reward"], task["noise"] = RewardConfig(**task["reward"]), NoiseConfig(**task["noise"])
     return from_mapping(CellConfig, about["cell"], Path("policy file")), TaskConfig(**task)
 
