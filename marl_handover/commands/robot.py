@@ -12,9 +12,8 @@ import numpy as np
 from marl_handover.cell.reach import bound_by, feasible
 from marl_handover.config import PICK_HEIGHT_MM, PITCH_DEG, SHAPES, BlockConfig, RobotConfig, bounded, check_bounds, chosen, path_field
 from marl_handover.errors import MissingExtra, MissingFile
-from marl_handover.geometry.canonical import require_moving
 from marl_handover.geometry.closed_form import ClosedFormArm
-from marl_handover.geometry.robot import describe, require_ring, robot_config, shaped_arm
+from marl_handover.geometry.robot import bare_arm, robot_config, shaped_arm
 from marl_handover.geometry.urdf import ARM_JOINTS
 
 FILE, PICTURE = "robot.json", "robot.png"
@@ -68,10 +67,7 @@ def run(config: RobotCommandConfig) -> int:
 
 def _read(settings: RobotConfig, may_lack_meshes: bool) -> ClosedFormArm:
     """The robot's kinematics and shapes; without shapes where its meshes are missing and that may be."""
-    description = describe(settings)
-    require_moving(description, needs_speed=False)
-    arm = ClosedFormArm(description, settings.joint_limits_deg)
-    require_ring(arm, settings)
+    arm = bare_arm(settings, needs_speed=False)
     try:
         return shaped_arm(arm, settings)
     except (MissingFile, MissingExtra) as error:
@@ -79,7 +75,7 @@ def _read(settings: RobotConfig, may_lack_meshes: bool) -> ClosedFormArm:
             raise
         note = f"shapes: none here, for want of one ({error}); cells need them, or shapes=links"
         bare = shaped_arm(arm, replace(settings, shapes="none")).description
-        return ClosedFormArm(replace(bare, assumed=(*description.assumed, note)), settings.joint_limits_deg)
+        return ClosedFormArm(replace(bare, assumed=(*arm.description.assumed, note)), settings.joint_limits_deg)
 
 
 def robot_summary(arm: ClosedFormArm, settings: RobotConfig) -> dict[str, Any]:

@@ -66,11 +66,16 @@ def read_robot(config: RobotConfig) -> ClosedFormArm:
         MissingFile, UrdfError, UnsupportedKinematics: of a URDF that is none, or of another class.
         UnknownKey, InvalidSetting: of limits.
     """
+    return shaped_arm(bare_arm(config), config)
+
+
+def bare_arm(config: RobotConfig, needs_speed: bool = True) -> ClosedFormArm:
+    """The same before its shapes are looked for; ``needs_speed`` and errors as :func:`require_moving` and :func:`read_robot` have them."""
     description = describe(config)
-    require_moving(description)
+    require_moving(description, needs_speed)
     arm = ClosedFormArm(description, config.joint_limits_deg)
     require_ring(arm, config)
-    return shaped_arm(arm, config)
+    return arm
 
 
 def shaped_arm(arm: ClosedFormArm, config: RobotConfig) -> ClosedFormArm:
