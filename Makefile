@@ -1,12 +1,18 @@
-# Needs Linux, make and Python 3.11 (or 3.12) with venv and pip; everything else goes into .venv.
+# Needs Linux, make and Python 3.11, 3.12 or 3.13 with venv and pip; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-lowest fuzz check format bench docs pretrained wheel clean
+.PHONY: help demo test test-slow test-pythons test-lowest fuzz check format bench docs pretrained wheel clean
 
-SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
-PYTHON ?= $(firstword $(foreach p,python3.11 python3 python3.12,$(shell $(p) -c "$(SUITABLE)" 2>/dev/null && echo $(p))))
-BIN := .venv/bin
-STAMP := .venv/.installed
+VERSIONS := 3.11 3.12 3.13
+SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+VERSION := import sys; print('%d.%d' % sys.version_info[:2])
+first_suitable = $(firstword $(foreach p,$(1),$(shell $(p) -c "$(SUITABLE)" 2>/dev/null && echo $(p))))
+# Interpreters of one version beside those on PATH: pyenv and uv keep them.
+kept = $(wildcard $(HOME)/.pyenv/versions/$(1).*/bin/python $(HOME)/.local/share/uv/python/cpython-$(1).*/bin/python)
+PYTHON ?= $(call first_suitable,python3.11 python3 python3.12 python3.13 $(foreach v,$(VERSIONS),$(call kept,$(v))))
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
 RUN := $(BIN)/marl-handover
 WORKERS ?= 2
 # Two workers on two cores: let no numerical library start threads of its own in each.
@@ -15,6 +21,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 help:
 	@echo "make demo       install, train a supervisor, evaluate it against the exact planner, leave pictures in runs/"
 	@echo "make test       install and run the tests; make test-slow the slow ones (wheel, SIGKILL, longer learners)"
+	@echo "make test-pythons the tests with Python 3.11, 3.12 and 3.13, as far as they are here"
 	@echo "make fuzz       20,000 random command lines over every key of every command, in one process (an hour or two)"
 	@echo "make test-lowest the tests with the lowest versions that pyproject.toml allows, in .venv-lowest"
 	@echo "make check      style, types and import layers; make format repairs the style"
@@ -24,9 +31,9 @@ help:
 	@echo "make wheel      build a wheel into dist/"
 
 $(STAMP): pyproject.toml constraints.txt
-	@if [ -z "$(PYTHON)" ]; then echo "make: Python 3.11 or 3.12 with venv and pip is needed; install it (apt install python3.11-venv) or name it: make PYTHON=/path/to/python3.11" >&2; exit 2; fi
-	@$(PYTHON) -c "$(SUITABLE)" 2>/dev/null || { echo "make: $(PYTHON) is not Python 3.11 or 3.12 with venv and pip; name another: make PYTHON=/path/to/python3.11" >&2; exit 2; }
-	@test -x $(BIN)/python && $(BIN)/python -c "$(SUITABLE)" 2>/dev/null || $(PYTHON) -m venv --clear .venv
+	@if [ -z "$(PYTHON)" ]; then echo "make: Python 3.11, 3.12 or 3.13 with venv and pip is needed; install it (apt install python3-venv) or name it: make PYTHON=/path/to/python3.12" >&2; exit 2; fi
+	@$(PYTHON) -c "$(SUITABLE)" 2>/dev/null || { echo "make: $(PYTHON) is $$($(PYTHON) -V 2>/dev/null || echo no Python), not 3.11, 3.12 or 3.13 with venv and pip; name another: make PYTHON=/path/to/python3.12" >&2; exit 2; }
+	@test -x $(BIN)/python && $(BIN)/python -c "$(SUITABLE)" 2>/dev/null || $(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	@touch $@
 
@@ -42,6 +49,15 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS)
+
+# In .venv first, then with every other Python that is here, each in an environment of its own.
+test-pythons: test
+	$(foreach v,$(filter-out $(shell $(BIN)/python -c "$(VERSION)"),$(VERSIONS)),$(call test_with,$(v),$(call first_suitable,python$(v) $(call kept,$(v)))))
+
+define test_with
+$(if $(2),$(MAKE) test VENV=.venv-$(1) PYTHON=$(2),@echo "make: no Python $(1) here, so nothing is tested with it")
+
+endef
 
 test-slow: $(STAMP)
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) --timeout 1800 -m "slow and not gpu and not hardware"
@@ -89,4 +105,4 @@ wheel: $(STAMP)
 	$(BIN)/python -m build --wheel --outdir dist .
 
 clean:
-	rm -rf .venv .venv-lowest build dist site .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache
+	rm -rf .venv .venv-* build dist site .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache

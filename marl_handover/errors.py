@@ -7,7 +7,9 @@ with ``exit_status``.
 from __future__ import annotations
 
 import errno
+import operator
 import re
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ CORE = ""
 
 
 def requirements() -> dict[str, tuple[str, ...]]:
-    """Requirements such as ``"viser>=1.1"`` of the core and of each extra; empty if nothing tells.
+    """Requirements such as ``"viser>=1.1"`` of the core and of each extra on this Python; empty if nothing tells.
 
     They are those of the checkout's pyproject.toml or of the installed package's metadata. An editable install's metadata is as old as the
     install, so the checkout goes first.
@@ -29,7 +31,8 @@ def requirements() -> dict[str, tuple[str, ...]]:
     file = Path(__file__).resolve().parents[1] / "pyproject.toml"
     if file.is_file():
         project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
-        return {CORE: tuple(project["dependencies"]), **{extra: tuple(lines) for extra, lines in project["optional-dependencies"].items()}}
+        groups = {CORE: project["dependencies"], **project["optional-dependencies"]}
+        return {extra: tuple(map(_unconditional, filter(applies, lines))) for extra, lines in groups.items()}
     try:
         return by_extra(requires(PACKAGE) or [])
     except PackageNotFoundError:
@@ -37,12 +40,25 @@ def requirements() -> dict[str, tuple[str, ...]]:
 
 
 def by_extra(lines: Iterable[str]) -> dict[str, tuple[str, ...]]:
-    """Requirements of the core and of each extra, from the lines of a package's metadata."""
+    """Requirements of the core and of each extra on this Python, from the lines of a package's metadata."""
     found: dict[str, list[str]] = {}
-    for line in lines:
+    for line in filter(applies, lines):
         extra = re.search(r"extra\s*==\s*['\"]([^'\"]+)", line)
-        found.setdefault(extra[1] if extra else CORE, []).append(line.partition(";")[0].strip())
+        found.setdefault(extra[1] if extra else CORE, []).append(_unconditional(line))
     return {extra: tuple(needed) for extra, needed in found.items()}
+
+
+def applies(requirement: str, python: tuple[int, int] = sys.version_info[:2]) -> bool:
+    """Whether what a requirement says of Python's version, such as ``python_version < '3.12'``, holds; true if it says nothing."""
+    said = re.findall(r"python_version\s*(<=?|>=?)\s*['\"](\d+)\.(\d+)['\"]", requirement)
+    return all(_COMPARED[sign](python, (int(major), int(minor))) for sign, major, minor in said)
+
+
+_COMPARED = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
+
+
+def _unconditional(requirement: str) -> str:
+    return requirement.partition(";")[0].strip()
 
 
 def name_of(requirement: str) -> str:

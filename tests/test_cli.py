@@ -139,7 +139,7 @@ def test_no_message_tells_to_install_this_package_from_an_index_that_has_it_not(
         assert not re.search(r"pip install ['\"\\]*marl[_-]handover", path.read_text(encoding="utf-8")), path
     assert install_line("view") == "pip install 'viser>=1.1'"
     assert str(MissingExtra("view", "viser", "view")).endswith("run: pip install 'viser>=1.1'")
-    assert "'pandas>=2.2,<3'" in install_line("compare")
+    assert "'pandas>=2.2.3,<3'" in install_line("compare")
     assert install_line("no-such-extra", ["something"]) == "pip install something"
 
 

@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from marl_handover.errors import MissingFile
 from marl_handover.files import resource_path
@@ -46,6 +47,20 @@ def test_the_wheel_holds_every_resource(wheel):
     assert {f"marl_handover/pretrained/{path.name}" for path in PRETRAINED} <= names
     assert "marl_handover/py.typed" in names
     assert not any(name.startswith(("tests/", "bench/", "configs/")) for name in names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("python", "engine"), [("3.11", "pybullet"), ("3.12", "mujoco"), ("3.13", "mujoco")])
+def test_the_wheel_asks_for_one_physics_engine_and_its_extras_for_the_other(wheel, python, engine):
+    archive = zipfile.ZipFile(wheel[0])
+    (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+    lines = archive.read(name).decode().splitlines()
+    needed = [Requirement(line.partition(": ")[2]) for line in lines if line.startswith("Requires-Dist: ")]
+    for extra, engines in {"": {engine}, "bullet": {engine, "pybullet"}, "mujoco": {engine, "mujoco"}}.items():
+        where = {"python_version": python, "extra": extra}
+        found = {line.name for line in needed if line.marker is None or line.marker.evaluate(where)}
+        assert found & {"pybullet", "mujoco"} == engines, extra
+    assert "Requires-Python: <3.14,>=3.11" in lines
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 
 from marl_handover.cli import main
 from marl_handover.commands import doctor
-from marl_handover.errors import CORE, by_extra, name_of, requirements
+from marl_handover.errors import CORE, applies, by_extra, name_of, requirements
 from marl_handover.hardware import session_registry, settings, transport
 from marl_handover.hardware.emulator.board import EmulatedBoard
 from marl_handover.hardware.emulator.device import EmulatedDevice
@@ -24,18 +24,38 @@ PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml")
 EXTRAS = PROJECT["optional-dependencies"]
 
 
-def test_every_requirement_is_looked_for_under_its_name():
+def _here(lines):
+    """Requirements whose conditions hold here, without these, as ``packaging`` reads them."""
+    read = map(Requirement, lines)
+    return [Requirement(f"{line.name}{line.specifier}") for line in read if line.marker is None or line.marker.evaluate({"extra": ""})]
+
+
+def test_every_requirement_of_this_python_is_looked_for_under_its_name():
     needed = requirements()
-    assert needed == {CORE: tuple(PROJECT["dependencies"]), **{extra: tuple(lines) for extra, lines in EXTRAS.items()}}
-    for line in (line for lines in needed.values() for line in lines):
-        assert name_of(line) == Requirement(line).name
+    assert list(needed) == [CORE, *EXTRAS]
+    for extra, lines in {CORE: PROJECT["dependencies"], **EXTRAS}.items():
+        found = [Requirement(line.replace("[python]", "")) for line in needed[extra]]
+        assert found == _here(lines), extra
+        assert [name_of(line) for line in needed[extra]] == [line.name for line in found]
 
 
 def test_an_installed_packages_metadata_says_the_same_as_the_checkout():
-    metadata = [*PROJECT["dependencies"], "tomli>=2; python_version < '3.11'"]
+    metadata = [*PROJECT["dependencies"], "tomli>=2; python_version < '3.11'", "more>=2; python_version > '3.10'"]
     metadata += [f"{line}; extra == '{extra}'" for extra, lines in EXTRAS.items() for line in lines]
     found, needed = by_extra(metadata), requirements()
-    assert found == {**needed, CORE: (*needed[CORE], "tomli>=2")}
+    assert found == {**needed, CORE: (*needed[CORE], "more>=2")}
+
+
+CONDITIONS = [f"python_version {sign} '{version}'" for sign in ("<", "<=", ">", ">=") for version in ("3.9", "3.11", "3.12", "3.13", "4.0")]
+
+
+@pytest.mark.parametrize("python", [(3, 9), (3, 11), (3, 12), (3, 13), (3, 14)])
+def test_a_condition_on_pythons_version_holds_where_packaging_says_that_it_does(python):
+    environment = {"python_version": "{}.{}".format(*python), "extra": "more"}
+    for condition in [*CONDITIONS, f"{CONDITIONS[0]} and {CONDITIONS[-1]}", f"{CONDITIONS[-1]} and extra == 'more'", "extra == 'more'"]:
+        line = f"some-package>=1; {condition}"
+        assert applies(line, python) == Requirement(line).marker.evaluate(environment), condition
+    assert applies("some-package>=1", python)
 
 
 def test_packages_of_an_extra_that_are_missing_are_named_with_the_line_that_installs_them(monkeypatch, capsys):
