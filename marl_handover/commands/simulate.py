@@ -141,11 +141,11 @@ def _episodes(
     config: SimulateCommand, policy: policies.SupervisorPolicy, model: Any, backend: BulletBackend, film: Film | None
 ) -> Iterator[Played]:
     from marl_handover.envs.handover_aec import raw_env
-    from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
+    from marl_handover.motion.executor import ExecutorAgent
 
     env = raw_env(backend=backend, cell=model, task=policy.rules.config, motion=config.motion)
     supervisor = policy.under(env.rules)
-    arms = {agent: ExecutorAgent(agent, model, motion=config.motion) for agent in ARM_AGENTS}
+    arms = {agent: ExecutorAgent(agent, model, motion=config.motion) for agent in env.arm_agents}
     problem = {}
     for key, given in (("state", config.start), ("goal", config.goal)):
         if given is not None:

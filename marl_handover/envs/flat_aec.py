@@ -16,6 +16,7 @@ from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 
 from marl_handover.envs.cycle_check import FAILURES
 from marl_handover.envs.spaces import SUPERVISOR
+from marl_handover.task.actions import choices_of
 
 Vector = NDArray[np.float32]
 
@@ -23,7 +24,7 @@ Vector = NDArray[np.float32]
 class FlatAEC(BaseWrapper):
     """One vector for each observation and action, fields in the order of the space; the supervisor's action is the rule book's.
 
-    The supervisor acts with (4,): final, arm, alpha, beta, in [-1, 1] and read by their sign as :meth:`Rules.decode` does. ``infos`` of
+    The supervisor acts with what :meth:`Rules.decode` reads, in [-1, 1]: of a pair (4,), final, arm, alpha, beta. ``infos`` of
     the supervisor are numbers, there from the reset on, so that TorchRL's wrapper hands them on: ``transfers`` so far, and of the last
     command ``placed`` (3,), the pose it left, before architecture A's external transfer, ``feasible``, 0 where the arm refused or the
     command was ignored because the episode was solved at its start, and ``ignored``, 1 in the latter case. Infos of arms are left out.
@@ -38,7 +39,7 @@ class FlatAEC(BaseWrapper):
         self._acts = {agent: fields_of(env.action_space(agent)) for agent in env.possible_agents}
         self._observed = {agent: _vector_space(env.observation_space(agent)) for agent in env.possible_agents}
         self._acted = {agent: _vector_space(env.action_space(agent)) for agent in env.possible_agents}
-        self._acted[SUPERVISOR] = Box(-1.0, 1.0, (4,))
+        self._acted[SUPERVISOR] = Box(-1.0, 1.0, (env.unwrapped.rules.action_size,))
         self._commanded = False
         self.infos: dict[str, dict[str, Any]] = {}
 
@@ -67,9 +68,11 @@ class FlatAEC(BaseWrapper):
             self.env.step(None)
             self.infos = {living: self.infos[living] for living in self.env.agents}
         elif agent == SUPERVISOR:
-            final, arm, *place = np.asarray(action, np.float32)
-            self.env.step({"final": int(final > 0), "arm": int(arm > 0), "place": np.array(place)})
+            self.env.step(choices_of(np.asarray(action, np.float32), self.env.unwrapped.rules.cell.num_arms))
             self._commanded = True
+            if self.env.agent_selection == SUPERVISOR:  # refused at once: no arm was asked
+                self._tell(self.infos[SUPERVISOR]["transfers"] + 1, self._pose(), False)
+                self._commanded = False
         else:
             external = self.env.unwrapped.rules.external_finish and bool(self.env.observe(agent)["final"])
             before = self._pose()

@@ -24,7 +24,7 @@ from marl_handover.config import CellConfig, LoopConfig, MotionConfig, NoiseConf
 from marl_handover.envs.backends import Backend, Correctable, KinematicBackend, make_backend
 from marl_handover.envs.cycle_check import FAILURES, CycleCheck, Refusal
 from marl_handover.envs.spaces import SUPERVISOR, Spaces, read_command, read_cycle
-from marl_handover.motion.executor import ARM_AGENTS
+from marl_handover.motion.executor import arm_agents
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.episode import conclude, final_transfer, measured_verdict
 from marl_handover.task.problems import ProblemSource
@@ -55,7 +55,9 @@ class Turn(NamedTuple):
 
 
 class HandoverEnv(AECEnv):
-    """Agents ``supervisor``, ``arm_left``, ``arm_right``; spaces in :mod:`marl_handover.envs.spaces`.
+    """Agents ``supervisor``, then ``arm_NAME`` of each arm; spaces in :mod:`marl_handover.envs.spaces`.
+
+    Those of a mirrored pair are ``supervisor``, ``arm_left``, ``arm_right``.
 
     Rewards: the supervisor's are r_A or r_B of the rule book, given when the transfers of its decision are over. The arm that acted gets
     ``-path_mm / 100``, or ``refused_reward`` for a transfer that was refused or failed; the other arms 0.
@@ -64,9 +66,9 @@ class HandoverEnv(AECEnv):
     ``outcome``; the infos of an arm that acted have ``refusal`` and ``path_mm``. All are empty at reset: TorchRL's wrapper takes infos for
     numbers if it finds some there.
 
-    A command that is none (wrong shape, not finite) asks no arm and is refused at once. One that an arm cannot carry out does ask it; its
-    answer is then ignored. A refused transfer counts as an infeasible one; one that failed on the way (:data:`FAILURES`) is judged by
-    where it left the object.
+    A command that is none (wrong shape, not finite) asks no arm and is refused at once, and so is one to an arm and a receiver that share
+    no place. One that an arm cannot carry out does ask it; its answer is then ignored. A refused transfer counts as an infeasible one; one
+    that failed on the way (:data:`FAILURES`) is judged by where it left the object.
 
     ``kinematic`` and ``noisy`` arms look at a path's ends and joint limits only: **nothing is checked for collision**, and one through the
     table or the other arm is carried out, unless ``backend_options={"check_collisions": True}`` (some milliseconds a transfer).
@@ -106,7 +108,7 @@ class HandoverEnv(AECEnv):
         task = task if architecture is None else replace(task, architecture=architecture)
         self.render_mode, self.refused_reward = render_mode, refused_reward
         self.model = cell if isinstance(cell, CellModel) else build_cell(cell_config(cell) if isinstance(cell, str) else cell)
-        self.model.cell.require_pair("the AEC environment")
+        self.arm_agents = arm_agents(self.model.cell)
         if isinstance(backend, str):
             backend = make_backend(backend, self.model, task, motion, **(backend_options or {}))
         self.backend = backend
@@ -160,7 +162,7 @@ class HandoverEnv(AECEnv):
         """What ``agent`` sees now, whether or not it is its turn."""
         if agent == SUPERVISOR:
             return self.spaces.supervisor_sees(self.rules, self._pose, self._goal, self._previous)
-        arm = ARM_AGENTS.index(agent)
+        arm = self.arm_agents.index(agent)
         turn = self._turn if self._turn is not None and self._turn.arm == arm else None
         target_mm, final = (self._pose[:2], False) if turn is None else (turn.target_mm, turn.final)
         return self.spaces.arm_sees(arm, turn is not None, target_mm, final, self._pose, self.backend.joints_rad())
@@ -202,23 +204,30 @@ class HandoverEnv(AECEnv):
             return
         numbers = read_command(action, self.model.cell.num_arms)
         if isinstance(numbers, Refusal):
-            none = Command(np.bool_(False), np.int64(0), self._pose[:2])
-            self._settle(Turn(0, self._pose[:2], self._pose, False, none), self._pose, numbers)
+            self._refuse(numbers)
             return
         command = self.rules.decode(numbers)
-        planned, feasible = self.rules.transfer(self._pose, self._goal, command)
         target_mm = self._goal[:2] if command.final else command.place_mm
+        if np.isnan(target_mm).any():
+            self._refuse(Refusal.OUT_OF_REACH)
+            return
+        planned, feasible = self.rules.transfer(self._pose, self._goal, command)
         self._ask(Turn(int(command.arm), target_mm, planned, bool(feasible), command))
+
+    def _refuse(self, refusal: Refusal) -> None:
+        """A command that no arm is asked to carry out."""
+        none = Command(np.bool_(False), np.int64(0), self._pose[:2])
+        self._settle(Turn(0, self._pose[:2], self._pose, False, none), self._pose, refusal)
 
     def _ask(self, turn: Turn) -> None:
         self._turn, self._place_mm = turn, turn.target_mm
-        self.agent_selection = ARM_AGENTS[turn.arm]
+        self.agent_selection = self.arm_agents[turn.arm]
 
     def _answer(self, turn: Turn, action: Any) -> None:
         """An arm's turn: carry out what it says, then judge."""
         self._turn, self._early = None, None
         refusal, placed, path_mm = self._carry_out(turn, action)
-        arm = ARM_AGENTS[turn.arm]
+        arm = self.arm_agents[turn.arm]
         self.rewards[arm] = -path_mm / 100 if refusal is None else self.refused_reward
         self.infos[arm] = {"refusal": refusal, "path_mm": path_mm}
         if turn.command is None:

@@ -15,8 +15,9 @@ from marl_handover.cell import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.geometry.arm_model import ArmModel
-from marl_handover.motion.executor import ARM_AGENTS
+from marl_handover.motion.executor import arm_agents
 from marl_handover.motion.trajectory import PickPlacePaths
+from marl_handover.task.actions import action_of
 from marl_handover.task.rules import Rules
 
 REASONS = (Refusal.DECLINED, Refusal.OUT_OF_REACH, Refusal.NO_PATH)
@@ -27,15 +28,18 @@ SNAP_RAD = 1e-6
 
 
 def read_command(action: Any, num_arms: int) -> Floats | Refusal:
-    """The supervisor's action as the rule book's (4,), or why it is none."""
+    """The supervisor's action as the rule book's (size,), or why it is none."""
     final, arm, place = _choice(action, "final", 2), _choice(action, "arm", num_arms), _numbers(action, "place", (2,))
+    receiver = 0 if num_arms == 2 else _choice(action, "receiver", num_arms)
     if isinstance(final, Refusal):
         return final
     if isinstance(arm, Refusal):
         return arm
+    if isinstance(receiver, Refusal):
+        return receiver
     if isinstance(place, Refusal):
         return place
-    return np.array([2.0 * final - 1.0, 2.0 * arm - 1.0, *place])
+    return action_of(final, arm, receiver, place, num_arms)
 
 
 def read_cycle(action: Any, control_points: int, arm: ArmModel) -> PickPlacePaths | Refusal:
@@ -88,6 +92,10 @@ class Spaces:
     ``2 * arm + final`` whether that command can be carried out, which without ``final`` takes that the arm reaches the object, with it that
     it reaches the goal as well; architecture A has no final commands. It acts with ``final``, ``arm`` and ``place``: alpha, beta.
 
+    Of N arms, N != 2, ``previous_arm`` is 0 or 1 + the arm's index, and ``legal`` is (N + N * N): the final commands of each arm, then at
+    ``N + N * arm + receiver`` the others, which also take that the two share a place. The action has a ``receiver`` besides: the place
+    lies in what the arm shares with it.
+
     An arm observes whether it is ``active``; the ``target`` (2,) it is to take the object to (the object's own place if it is not active),
     world, mm; the ``object`` (3,); its ``joints`` (5,) and those of the others, ``other_joints``; and whether the transfer is ``final``. It
     acts with ``paths`` (3, N, 5): control points in rad of approach, transfer and retreat; ``grasp`` and ``release``: 0 declines, and then
@@ -97,11 +105,14 @@ class Spaces:
     def __init__(self, model: CellModel, motion: MotionConfig) -> None:
         cell = model.cell
         self.num_arms, self.control_points = cell.num_arms, motion.control_points
+        self._shares = np.zeros((self.num_arms, self.num_arms), bool)
+        for pair in cell.graph.edges:
+            self._shares[pair] = self._shares[pair[::-1]] = True
         self._high = np.array([*(value + EDGE_MM for value in cell.extent_mm), math.pi], np.float32)
         self._lower = np.stack([arm.lower_rad for arm in model.arms]).astype(np.float32)
         self._upper = np.stack([arm.upper_rad for arm in model.arms]).astype(np.float32)
         self.observation, self.action = {SUPERVISOR: self._supervisor_sees()}, {SUPERVISOR: self._supervisor_acts()}
-        for arm, agent in enumerate(ARM_AGENTS[: self.num_arms]):
+        for arm, agent in enumerate(arm_agents(cell)):
             self.observation[agent], self.action[agent] = self._arm_sees(arm), self._arm_acts(arm)
 
     def supervisor_sees(self, rules: Rules, pose: Floats, goal: Floats, previous_arm: Any) -> dict[str, Any]:
@@ -112,8 +123,14 @@ class Spaces:
             "state": self._shown(pose),
             "goal": self._shown(goal),
             "previous_arm": np.int64(previous_arm + 1),
-            "legal": np.stack([picks, places], -1).reshape(-1).astype(np.int8),
+            "legal": self._legal(picks, places).astype(np.int8),
         }
+
+    def _legal(self, picks: NDArray[np.bool_], places: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which commands can be carried out by arms (N,) that pick up the object, and, of these, place it at the goal."""
+        if self.num_arms == 2:
+            return np.stack([picks, places], -1).reshape(-1)
+        return np.concatenate([places, (picks[:, None] & self._shares).reshape(-1)])
 
     def arm_sees(self, arm: int, active: bool, target_mm: Floats, final: bool, pose: Floats, joints_rad: Floats) -> dict[str, Any]:
         """An arm's observation; ``joints_rad`` (num_arms, 5) are those of all arms."""
@@ -136,11 +153,14 @@ class Spaces:
             state=Box(-self._high, self._high),
             goal=Box(-self._high, self._high),
             previous_arm=Discrete(self.num_arms + 1),
-            legal=MultiBinary(2 * self.num_arms),
+            legal=MultiBinary(4 if self.num_arms == 2 else self.num_arms + self.num_arms**2),
         )
 
     def _supervisor_acts(self) -> Dict:
-        return Dict(final=Discrete(2), arm=Discrete(self.num_arms), place=Box(-1.0, 1.0, (2,)))
+        place = Box(-1.0, 1.0, (2,))
+        if self.num_arms == 2:
+            return Dict(final=Discrete(2), arm=Discrete(2), place=place)
+        return Dict(final=Discrete(2), arm=Discrete(self.num_arms), receiver=Discrete(self.num_arms), place=place)
 
     def _arm_sees(self, arm: int) -> Dict:
         return Dict(

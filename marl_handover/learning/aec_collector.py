@@ -38,7 +38,7 @@ from marl_handover.learning.algorithm import Algorithm
 from marl_handover.learning.collector import Collected, Collector, Explore, TransitionReader
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.learning.variant import make_variant
-from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
+from marl_handover.motion.executor import ExecutorAgent, arm_agents
 from marl_handover.plugins import Parcel
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Outcome, Rules
@@ -87,14 +87,15 @@ class AecPolicy(TensorDictModuleBase):
         super().__init__()
         motion = MotionConfig()
         spaces = Spaces(model, motion)
-        self.in_keys = [(agent, key) for agent in (SUPERVISOR, *ARM_AGENTS) for key in ("mask", "observation")] + [(SUPERVISOR, "info")]
-        self.out_keys = [(SUPERVISOR, "action"), (SUPERVISOR, "epsilon"), *((arm, "action") for arm in ARM_AGENTS)]
+        arms = arm_agents(model.cell)
+        self.in_keys = [(agent, key) for agent in (SUPERVISOR, *arms) for key in ("mask", "observation")] + [(SUPERVISOR, "info")]
+        self.out_keys = [(SUPERVISOR, "action"), (SUPERVISOR, "epsilon"), *((arm, "action") for arm in arms)]
         self.rules, self.explore = rules, explore
         self.device_of_learner = torch.device(config.device)
         self.epsilon_range_rad = (rules.epsilon_rad, rules.epsilon_rad)
         self._fields = {agent: fields_of(space) for agent, space in spaces.observation.items()}
         self._widths = {agent: width(space) for agent, space in spaces.action.items()}
-        self._arms = {agent: ExecutorAgent(agent, model, config.executor, motion) for agent in ARM_AGENTS}
+        self._arms = {agent: ExecutorAgent(agent, model, config.executor, motion) for agent in arms}
         self._random = np.random.default_rng(seed)
         self._epsilon = np.full(count, rules.epsilon_rad)
 
@@ -106,7 +107,7 @@ class AecPolicy(TensorDictModuleBase):
             action[turn] = self._commands(tensordict[SUPERVISOR], turn[:, 0].numpy())[turn[:, 0]]
         tensordict.set((SUPERVISOR, "action"), action)
         tensordict.set((SUPERVISOR, "epsilon"), torch.from_numpy(self._epsilon.astype(np.float32))[:, None, None])
-        for agent in ARM_AGENTS:
+        for agent in self._arms:
             answers = torch.zeros(len(turn), 1, self._widths[agent])
             for row in tensordict[agent, "mask"][:, 0].nonzero()[:, 0].tolist():
                 answers[row, 0] = self._answer(agent, tensordict[agent, "observation"][row, 0])

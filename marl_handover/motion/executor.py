@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.cell import CellModel, build_cell, cell_config
+from marl_handover.cell import Cell, CellModel, build_cell, cell_config
 from marl_handover.config import CellConfig, MotionConfig, require_choice
 from marl_handover.errors import HandoverError, InvalidSetting
 from marl_handover.motion.home import parked_poses
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-ARM_AGENTS = ("arm_left", "arm_right")
-"""Names of the arms' agents, by arm index."""
-
 METHODS = ("optimised", "direct")
 
 DECLINED, OUT_OF_REACH, NO_PATH = range(3)
@@ -32,13 +29,18 @@ ROLL_RAD = 0.02
 """The planner starts from wrist roll 0; a measured roll up to this is taken for it."""
 
 
+def arm_agents(cell: Cell) -> tuple[str, ...]:
+    """Names of the arms' agents, by arm index: ``arm_left`` and ``arm_right`` of a mirrored pair."""
+    return tuple(f"arm_{name}" for name in cell.names)
+
+
 class ExecutorAgent:
     """Plays one arm of the AEC environment.
 
     ``last_refusal`` says why the last call of :meth:`act` declined; None if it did not.
 
     Args:
-        agent: ``"arm_left"`` or ``"arm_right"``.
+        agent: one of :func:`arm_agents`: ``"arm_left"`` or ``"arm_right"`` of a mirrored pair.
         cell: a shipped cell's name, a YAML path, settings, or a cell that is built already.
         method: ``"optimised"``: collision-free shortest paths; ``"direct"``: straight lines in joint space between the ends, which may
             touch anything, for kinematic backends.
@@ -48,13 +50,14 @@ class ExecutorAgent:
     def __init__(
         self, agent: str, cell: str | CellConfig | CellModel = "paper", method: str = "optimised", motion: MotionConfig | None = None
     ) -> None:
-        require_choice("agent", agent, ARM_AGENTS)
         require_choice("method", method, METHODS)
         self.agent, self.method, self.motion = agent, method, motion or MotionConfig()
         if self.motion.method != "optimised":  # its splines have another number of control points than the action space
             raise InvalidSetting("motion.method", self.motion.method, "optimised for an agent of the AEC environment")
-        self.arm = ARM_AGENTS.index(agent)
         self.model = cell if isinstance(cell, CellModel) else build_cell(cell_config(cell) if isinstance(cell, str) else cell)
+        agents = arm_agents(self.model.cell)
+        require_choice("agent", agent, agents)
+        self.arm = agents.index(agent)
         self.last_refusal: str | None = None
         self._planner: MotionPlanner | None = None
 
@@ -98,7 +101,7 @@ class ExecutorAgent:
     ) -> PickPlacePaths:
         joints = joints_rad.copy()
         joints[4] = joints[4] if abs(joints[4]) > ROLL_RAD else 0.0
-        return planner.plan_paths(self.arm, pick_mm, place_mm, joints, others_rad).paths
+        return planner.plan_paths(self.arm, pick_mm, place_mm, joints, others_rad.reshape(-1, len(joints))).paths
 
 
 def _code(failure: HandoverError) -> int:

@@ -1,9 +1,9 @@
 """What a supervisor policy answers, and a shield that repairs its answers. Nothing here needs torch.
 
 A policy answers two calls: ``policy(observation)`` takes one observation of the AEC supervisor (``state``, ``goal``,
-``previous_arm`` 0 none, 1 L, 2 R) and returns its action (``final``, ``arm``, ``place``); ``policy.act(pose, goal,
-previous_arm)`` takes batches (n, 3), (n, 3), (n,) (-1 none, 0 L, 1 R), or single problems (3,), (3,), (), and returns
-actions (n, 4) or (4,).
+``previous_arm`` 0 none, 1 L, 2 R, or 1 + the arm's index) and returns its action (``final``, ``arm``, ``place``, and ``receiver`` unless
+there are two arms); ``policy.act(pose, goal, previous_arm)`` takes batches (n, 3), (n, 3), (n,) (-1 none, 0 L, 1 R), or single problems
+(3,), (3,), (), and returns actions (n, size) or (size,), 4 numbers for a pair (:mod:`marl_handover.task.actions`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from marl_handover.arrays import Floats
 from marl_handover.errors import WorkFailed
+from marl_handover.task.actions import action_of, choices_of
 from marl_handover.task.rules import Outcome, Rules
 
 SHIELDED = "shielded:"
@@ -49,16 +50,31 @@ class SupervisorPolicy(ABC):
 
     @abstractmethod
     def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
-        """Actions: final, arm, alpha, beta. One that is not a number: no arm is to move."""
+        """Actions (..., size): final, arm, alpha, beta of a pair. One that is not a number: no arm is to move."""
 
     def alternatives(self, action: Floats, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
         """What it would rather do if it could not do ``action`` (..., size): (..., k, size), the best first.
 
-        Here: another final, then the other arm, then both, at the same place. They must hold all four choices.
+        Here: another final, then the other arm, then both, at the same place. They must hold all four choices. Of N arms: the same arm
+        first, then all others, each with every receiver that it shares a place with.
         """
+        if self.rules.cell.num_arms != 2:
+            return self._others_of_many(action)
         chosen = np.where(action[..., None, :2] > 0, 1.0, -1.0) * np.array([[-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
         rest = np.broadcast_to(action[..., None, 2:], (*chosen.shape[:-1], action.shape[-1] - 2))
         return np.concatenate([chosen, rest], -1)
+
+    def _others_of_many(self, action: Floats) -> Floats:
+        """All choices of a cell of N arms at the place of ``action`` (..., size), the most similar first: (..., k, size)."""
+        graph, count = self.rules.cell.graph, self.rules.cell.num_arms
+        choices = [
+            (final, arm, receiver) for final in (0, 1) for arm in range(count) for receiver in graph.neighbours(arm)[: 1 if final else None]
+        ]
+        final, arm, receiver = (np.array(column) for column in zip(*choices, strict=True))
+        was_final, was_arm = action[..., :1] > 0, action[..., 1 : 1 + count].argmax(-1)[..., None]
+        order = np.argsort(2 * (arm != was_arm) + (final != was_final), -1, kind="stable")
+        place = np.broadcast_to(action[..., None, -2:], (*order.shape, 2))
+        return action_of(final[order] > 0, arm[order], receiver[order], place, count)
 
     def under(self, rules: Rules) -> SupervisorPolicy:
         """The same policy acting under another rule book, with another epsilon for instance."""
@@ -81,7 +97,7 @@ class SupervisorPolicy(ABC):
         action = self.act(pose, goal, np.asarray(observation["previous_arm"]) - 1)
         if np.isnan(action).any():
             raise NobodyMoves(self.name)
-        return {"final": int(action[0] > 0), "arm": int(action[1] > 0), "place": np.asarray(action[2:], np.float32)}
+        return choices_of(action, self.rules.cell.num_arms)
 
 
 class ShieldedPolicy(SupervisorPolicy):

@@ -9,13 +9,14 @@ import math
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import shortest_path
 
-from marl_handover.arrays import select
 from marl_handover.cell import Cell, load_cell
 from marl_handover.config import CellConfig, CentralisedConfig, MotionConfig, TaskConfig
 from marl_handover.errors import CheckpointMismatch, CorruptFile, HandoverError, InvalidSetting, MissingFile, UnknownChoice, first_line
@@ -25,6 +26,7 @@ from marl_handover.parsing import parse_object
 from marl_handover.plugins import Registry
 from marl_handover.policies.files import KINDS, read_policy, require_policy, stored_settings
 from marl_handover.policies.policy import SHIELDED, Floats, ShieldedPolicy, SupervisorPolicy
+from marl_handover.task.actions import action_of
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Rules
 
@@ -32,6 +34,9 @@ Arrays = Mapping[str, NDArray[Any]]
 
 POLICIES: Registry[Callable[[Rules, int], SupervisorPolicy]] = Registry("policy")
 """Policies that need no file: called with a rule book and a seed. ``POLICIES.register("NAME")`` adds one."""
+
+_FAR_MM2 = 1e12
+"""Squared distance that counts for more than any between an arm and an object."""
 
 PRETRAINED = ("pretrained_a", "pretrained_b", "pretrained_twin")
 
@@ -70,13 +75,21 @@ class RandomPolicy(SupervisorPolicy):
 
     def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
         """Anything."""
-        return self.generator.uniform(-1.0, 1.0, (*pose.shape[:-1], 4))
+        return self.generator.uniform(-1.0, 1.0, (*pose.shape[:-1], self.rules.action_size))
+
+
+@lru_cache(maxsize=64)
+def _hops(num_arms: int, edges: tuple[tuple[int, int], ...]) -> NDArray[np.int64]:
+    """The fewest hand-overs from each arm to each other one: (num_arms, num_arms)."""
+    adjacency = np.zeros((num_arms, num_arms))
+    adjacency[tuple(zip(*edges, strict=True))] = 1.0
+    return shortest_path(adjacency, directed=False, unweighted=True).astype(np.int64)
 
 
 @POLICIES.register("greedy")
 class GreedyPolicy(SupervisorPolicy):
-    """Nearest arm: finishes when an arm can; else the nearer arm hands over, at the place of a few that leaves the other the
-    least error.
+    """Nearest arm: finishes when an arm can; else the nearest arm hands over, at the place of a few that leaves the next one the
+    least error. Among many arms, the object goes to those that are fewer hand-overs away from one that reaches the goal.
     """
 
     PLACES = 33
@@ -90,17 +103,38 @@ class GreedyPolicy(SupervisorPolicy):
         able = self.rules.can_finish(pose, goal)
         finish = able.any(-1)
         square, yaw = cell.polar(pose)
-        near = np.where(cell.within(square, yaw), square, math.inf).argmin(-1)
+        away = self._away(goal)
+        # Distances decide between arms that can pass the object to one that reaches the goal, or do themselves.
+        far = np.where(cell.within(square, yaw), square + _FAR_MM2 * np.maximum(away - 1, 0), math.inf)
+        near = far.argmin(-1)
+        receiver, place = self._hand_over(near, pose, yaw, goal, away)
+        return action_of(finish, np.where(finish, able.argmax(-1), near), receiver, place, cell.num_arms)
+
+    def _away(self, goal: Floats) -> NDArray[np.int64]:
+        """How many hand-overs each arm (..., num_arms) is away from one that reaches the goal (..., 3)."""
+        cell = self.rules.cell
+        hops = _hops(cell.num_arms, tuple(cell.graph.edges))
+        away: NDArray[np.int64] = np.where(cell.reaches(goal)[..., None, :], hops, cell.num_arms).min(-1)
+        return away
+
+    def _hand_over(
+        self, near: NDArray[np.int64], pose: Floats, yaw: Floats, goal: Floats, away: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], Floats]:
+        """Receiver (...) and place (..., 2) of hand-overs by the arms ``near`` (...), which see the object at base yaws (..., num_arms)."""
+        cell, rules = self.rules.cell, self.rules
         alpha = np.linspace(-1.0, 1.0, self.PLACES)
-        table = cell.shared.to_table(alpha, 0 * alpha)
-        turn = cell.polar(table)[1] - yaw[..., None, :]
-        placed_theta = pose[..., 2, None] + select(turn, np.broadcast_to(near[..., None], turn.shape[:-1]))
-        placed = np.concatenate([np.broadcast_to(table, (*placed_theta.shape, 2)), placed_theta[..., None]], -1)
-        error = abs(self.rules.finishing_error(placed, np.broadcast_to(goal[..., None, :], placed.shape)))
-        other = np.broadcast_to((1 - near)[..., None], placed_theta.shape)
-        best = select(error, other).argmin(-1)
-        arm = np.where(finish, able.argmax(-1), near)
-        return np.stack([np.where(finish, 1.0, -1.0), np.where(arm > 0, 1.0, -1.0), alpha[best], 0.0 * alpha[best]], -1)
+        goal_yaw = cell.polar(goal)[1]
+        least, receiver, at = np.full(np.shape(near), math.inf), np.zeros_like(near), np.zeros(np.shape(near))
+        for (i, j), space in cell.graph.edges.items():
+            seen = cell.polar(space.to_table(alpha, 0 * alpha))[1]
+            for giver, other in ((i, j), (j, i)):
+                theta = pose[..., 2, None] + (seen[:, giver] - yaw[..., giver, None])
+                error = abs(rules.orientation_error(theta + (goal_yaw[..., other, None] - seen[:, other]), goal[..., 2, None]))
+                best = error.argmin(-1)
+                left = error.min(-1) + 2 * math.pi * away[..., other]
+                better = (near == giver) & (left < least)
+                least, receiver, at = np.where(better, left, least), np.where(better, other, receiver), np.where(better, alpha[best], at)
+        return receiver, np.stack([at, 0.0 * at], -1)
 
 
 def load(

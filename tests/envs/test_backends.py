@@ -18,7 +18,7 @@ from marl_handover.envs.collision_check import CollisionFinder
 from marl_handover.envs.cycle_check import JOIN_TOLERANCE_RAD, CycleCheck, welded
 from marl_handover.envs.spaces import read_cycle
 from marl_handover.errors import InvalidSetting, UnknownChoice
-from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
+from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.motion.pick_place import timed_phases
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import PickPlacePaths
@@ -200,7 +200,7 @@ def test_a_path_through_the_other_arm_is_refused_when_that_is_looked_for(paper_m
 
 def test_what_the_executor_plans_touches_nothing(paper_model, careful, draw):
     """Of all transfers within reach, what its float32 action says; straight lines in joint space drag the block over the table."""
-    agents = {method: ExecutorAgent(ARM_AGENTS[0], paper_model, method) for method in ("optimised", "direct")}
+    agents = {method: ExecutorAgent("arm_left", paper_model, method) for method in ("optimised", "direct")}
     came = {method: [] for method in agents}
     for pose, goal in zip(*draw(paper_model.cell, 100, 0)[:2], strict=True):
         if not paper_model.cell.reaches(np.stack([pose, goal]))[:, 0].all():
@@ -343,7 +343,7 @@ def test_an_agents_direct_cycle_is_carried_out(paper_model):
     """The float32 numbers of the agent's action are exact enough."""
     backend = started(KinematicBackend, paper_model)
     observation = {"object": START, "target": PLACE_MM, "joints": PARKED, "other_joints": PARKED}
-    action = ExecutorAgent(ARM_AGENTS[0], paper_model, "direct").act(observation)
+    action = ExecutorAgent("arm_left", paper_model, "direct").act(observation)
     execution = backend.execute(0, PickPlacePaths(*action["paths"].astype(float)))
     assert execution.refusal is None
     np.testing.assert_allclose(execution.pose[:2], PLACE_MM, atol=1e-3)

@@ -10,7 +10,7 @@ import pytest
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import MotionConfig
 from marl_handover.errors import UnknownChoice
-from marl_handover.motion.executor import ARM_AGENTS, ExecutorAgent
+from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.motion.trajectory import evaluate
 from tests.canonical_arms import PARKED_DEG
 
@@ -38,7 +38,7 @@ def asked(pick_mm, place_mm, joints=PARKED):
 @pytest.mark.parametrize("arm", [0, 1])
 def test_direct_cycles_end_level_at_pin_and_place(arm, model):
     """Over the whole annulus sector, its edges and corners included; by the arm's own forward kinematics."""
-    cell, agent = model.cell, ExecutorAgent(ARM_AGENTS[arm], model, "direct")
+    cell, agent = model.cell, ExecutorAgent(("arm_left", "arm_right")[arm], model, "direct")
     random = np.random.default_rng(arm)
     sides = [(radius, yaw) for radius in (cell.r_min_mm, cell.r_max_mm) for yaw in (*cell.yaw_rad, 0.0)]
     inside = list(zip(random.uniform(cell.r_min_mm, cell.r_max_mm, 200), random.uniform(*cell.yaw_rad, 200), strict=True))

@@ -75,7 +75,7 @@ def test_each_arm_moves_by_its_own_lengths_and_limits_past_the_others_own_shapes
 def test_agents_and_the_check_of_cycles_know_each_arm(mixed):
     check, model = CycleCheck(mixed.model, mixed.motion), mixed.model
     arm = 1
-    agent = ExecutorAgent("arm_right", model)
+    agent = ExecutorAgent("arm_arm1", model)
     assert agent.arm == arm
     pick, place = next(random_transfers(mixed, arm, 1, seed=8))
     seen = {"object": [*pick, 0.0], "target": place, "joints": mixed.homes_rad[arm], "other_joints": mixed.others_home_rad(arm)}

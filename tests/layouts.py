@@ -1,0 +1,34 @@
+"""Cells of 2 to 8 arms that tests share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from marl_handover.cell import build_cell
+from marl_handover.config import ArmConfig, CellConfig
+
+
+def ring(count, side_mm=360.0):
+    """Arms on a regular polygon, each facing its middle; two of them are a mirrored pair."""
+    radius, angles = side_mm / (2 * math.sin(math.pi / count)), 2 * math.pi / count * np.arange(count)
+    return [ArmConfig(f"a{k}", radius * math.cos(a), radius * math.sin(a), math.degrees(a) - 180.0) for k, a in enumerate(angles)]
+
+
+def line(count, side_mm=340.0):
+    """Arms in a zigzag row: only neighbours share a place."""
+    x, y = side_mm * math.cos(math.radians(35.0)), side_mm * math.sin(math.radians(35.0))
+    return [ArmConfig(f"b{k}", k * x, (k % 2) * y, 90.0 if k % 2 == 0 else -90.0) for k in range(count)]
+
+
+MODELS = {}
+
+
+def model_of(count, layout=ring):
+    """A cell of so many arms, built once."""
+    key = count, layout
+    if key not in MODELS:
+        MODELS[key] = build_cell(replace(CellConfig(name="many", grid_mm=10.0, chart="angle"), arms=layout(count)))
+    return MODELS[key]
