@@ -78,6 +78,8 @@ BACKENDS: Registry[Any] = Registry(
 SHAPES = ("file", "links", "none")
 APPROACHES = ("", "+x", "-x", "+y", "-y", "+z", "-z")
 CHARTS = ("paper", "angle")
+SHAPES_OF_OBSTACLES = ("disc",)
+MOST_ARMS = 8
 MOTION_METHODS = ("optimised", "paper")
 EXPLORATIONS = ("chart", "area")
 LEARNERS = ("independent", "shared", "ctde")
@@ -155,6 +157,17 @@ class ArmConfig:
 
 
 @dataclass
+class ObstacleConfig:
+    """Something that stands on the table: where nothing may be put."""
+
+    x_mm: float = bounded(0.0, -10_000.0, 10_000.0)
+    y_mm: float = bounded(0.0, -10_000.0, 10_000.0)
+    radius_mm: float = bounded(10.0, 0.1, 10_000.0)  # the block's centre keeps this and half the block's diagonal away
+    height_mm: float = bounded(50.0, 0.1, 10_000.0)
+    shape: str = chosen("disc", SHAPES_OF_OBSTACLES)
+
+
+@dataclass
 class CellConfig:
     """Arms around a shared piece of table; the defaults are the paper's cell, two mirrored arms of one robot.
 
@@ -163,7 +176,10 @@ class CellConfig:
 
     name: str = "paper"
     robot: str = path_field("al5a_paper")  # the name of a file in configs/robot, or the path of a robot's YAML file or URDF
-    arms: list[ArmConfig] = sized(list, 0, 16)  # one entry an arm; empty, or two that are not placed: face to face, base_distance_mm apart
+    arms: list[ArmConfig] = sized(
+        list, 0, MOST_ARMS
+    )  # one entry an arm; empty, or two that are not placed: face to face, base_distance_mm apart
+    obstacles: list[ObstacleConfig] = sized(list, 0, 64)
     base_distance_mm: float | None = bounded(None, 10.0, 10_000.0)  # null: 0.78 of the sum of the outer radii, if that gives a shared space
     grasp_link: str = ""  # the robots' tip
     pick_height_mm: float | None = bounded(None, *PICK_HEIGHT_MM)
@@ -174,7 +190,7 @@ class CellConfig:
     fit_rounding_mm: float = bounded(1.0, 0.0, 100.0)  # fitted radii are rounded inwards to a multiple of this; 0 keeps them
     r_min_mm: float | None = bounded(None, 1.0, 10_000.0)  # rings begin no nearer than this ...
     r_max_mm: float | None = bounded(None, 1.0, 10_000.0)  # ... and end no farther; null: what the arms reach
-    chart: str | None = chosen(None, CHARTS)  # of what two arms share; null: the paper's for equal rings, else by hand-over angles
+    chart: str | None = chosen(None, CHARTS)  # of what two arms share; null: the paper's for equal rings face to face, else by angles
     chart_inset: float = bounded(1.0, 0.1, 1.0)  # part of the chart that is used: 1 = all, 0.95 leaves room for placement noise
     block: BlockConfig = field(default_factory=BlockConfig)
 

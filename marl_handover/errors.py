@@ -243,10 +243,22 @@ class UnequalArms(HandoverError):
 class UnconnectedArms(HandoverError):
     """Some arms of a cell cannot pass an object to the others, however long the way."""
 
-    def __init__(self, groups: Sequence[Sequence[str]]) -> None:
+    def __init__(self, groups: Sequence[Sequence[str]], obstacles: bool = False) -> None:
         self.groups = [list(group) for group in groups]
         listed = " and ".join(f"({', '.join(group)})" for group in self.groups)
-        super().__init__(f"the arms fall into groups that share no place: {listed}; stand them nearer to each other, or turn them")
+        fix = "turn them, or move the obstacles" if obstacles else "or turn them"
+        super().__init__(f"the arms fall into groups that share no place: {listed}; stand them nearer to each other, {fix}")
+
+
+class BlockedPlace(HandoverError):
+    """A position where an obstacle keeps anything from being put. ``disc``: its x, y and radius, half the block's diagonal included."""
+
+    def __init__(self, what: str, position_mm: tuple[float, float], disc: tuple[float, float, float]) -> None:
+        self.what, self.position_mm, self.disc = what, position_mm, disc
+        super().__init__(
+            f"{what} ({position_mm[0]:g}, {position_mm[1]:g}) mm is inside an obstacle; it must be at least {disc[2]:.1f} mm "
+            f"from ({disc[0]:g}, {disc[1]:g}) mm, half the block's diagonal included"
+        )
 
 
 class OutOfReach(HandoverError):

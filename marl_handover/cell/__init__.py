@@ -4,6 +4,7 @@ from marl_handover.cell.arm import Arm
 from marl_handover.cell.build import CellModel, build_cell, carry_robots, cell_config, load_cell, with_carried_robots
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.chart import AngleChart, Chart, PaperChart
+from marl_handover.cell.layouts import layout_cell
 from marl_handover.cell.symmetry import LEFT, NO_ARM, RIGHT, Symmetry
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "build_cell",
     "carry_robots",
     "cell_config",
+    "layout_cell",
     "load_cell",
     "with_carried_robots",
 ]

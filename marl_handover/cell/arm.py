@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,6 +55,14 @@ class Arm:
         if self.lateral_mm:
             yaw_rad = np.asarray(yaw_rad, float) + lateral_rad(self.lateral_mm, radius_mm)
         return self.base.around(radius_mm, yaw_rad)
+
+
+class Disc(NamedTuple):
+    """A round place on the table, of which the centre of an object keeps clear."""
+
+    x_mm: float
+    y_mm: float
+    radius_mm: float
 
 
 def lateral_rad(lateral_mm: ArrayLike, radius_mm: ArrayLike) -> NDArray[np.float64]:

@@ -137,13 +137,15 @@ def _automatic_distance_mm(config: CellConfig, names: Sequence[str], robots: Seq
     least, most = one.r_min_mm + other.r_min_mm, one.r_max_mm + other.r_max_mm
     nominal = max(SPREAD * most, least + 0.25 * (most - least))
     candidates = 10.0 * np.arange(1, int(most // 10) + 1)
-    for distance in candidates[np.argsort(abs(candidates - round(nominal, -1)), kind="stable")]:
-        first, second = _arms(names, mirrored_pair(float(distance)), robots, fits, kinds)
-        try:
-            _ = SharedSpace(first, second, 1.0, config.chart).chart.arcs
-        except (NoSharedSpace, InvalidSetting):
-            continue
-        return float(distance)
+    alike = "paper" if config.chart is None and one == other else config.chart  # a lens before anything else
+    for charted in dict.fromkeys((alike, config.chart)):
+        for distance in candidates[np.argsort(abs(candidates - round(nominal, -1)), kind="stable")]:
+            first, second = _arms(names, mirrored_pair(float(distance)), robots, fits, kinds)
+            try:
+                _ = SharedSpace(first, second, 1.0, charted).chart.arcs
+            except (NoSharedSpace, InvalidSetting):
+                continue
+            return float(distance)
     if config.chart == "paper" and one != other:
         _ = SharedSpace(first, second, 1.0, config.chart).chart  # says what that chart needs
     rings = " and ".join(f"{name} {fits[robot].r_min_mm:g} to {fits[robot].r_max_mm:g}" for name, robot in zip(names, robots, strict=True))

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from marl_handover.arrays import Array, namespace, one_where, wrap
-from marl_handover.cell.arm import REACH_TOLERANCE_MM, Arm, lateral_rad
+from marl_handover.cell.arm import REACH_TOLERANCE_MM, Arm, Disc, lateral_rad
 from marl_handover.cell.chart import Chart, PaperChart
 from marl_handover.cell.shared_space import HandoverGraph, SharedSpace
 from marl_handover.cell.symmetry import ARM_LETTERS, Symmetry, View, pair_views, symmetries
 from marl_handover.config import CellConfig
-from marl_handover.errors import InvalidSetting, OutOfReach, TwoArmsOnly, UnconnectedArms, UnequalArms
+from marl_handover.errors import BlockedPlace, InvalidSetting, OutOfReach, TwoArmsOnly, UnconnectedArms, UnequalArms
 from marl_handover.geometry.se2 import SE2
 
 
@@ -40,10 +40,12 @@ class Cell:
     config: CellConfig
 
     def __post_init__(self) -> None:
+        if self.num_arms != 2 and self.config.chart == "paper":
+            raise InvalidSetting("cell.chart", "paper", f"'angle' or null for {self.num_arms} arms: the paper's chart is for two")
         if self.num_arms == 2:
             _ = self.chart
         elif not self.graph.is_connected:
-            raise UnconnectedArms([[self.names[arm] for arm in group] for group in self.graph.components])
+            raise UnconnectedArms([[self.names[arm] for arm in group] for group in self.graph.components], bool(self.keep_out))
 
     @property
     def num_arms(self) -> int:
@@ -109,13 +111,21 @@ class Cell:
     def graph(self) -> HandoverGraph:
         """Who can pass to whom."""
         pairs = [(i, j) for i in range(self.num_arms) for j in range(i + 1, self.num_arms)]
-        spaces = {(i, j): SharedSpace(self.arms[i], self.arms[j], self.config.chart_inset, self.config.chart) for i, j in pairs}
+        charted = self.config.chart if self.num_arms == 2 else "angle"
+        rest = self.config.chart_inset, charted, self.keep_out
+        spaces = {(i, j): SharedSpace(self.arms[i], self.arms[j], *rest) for i, j in pairs}
         return HandoverGraph(self.names, {pair: space for pair, space in spaces.items() if self.num_arms == 2 or not space.is_empty})
+
+    @cached_property
+    def keep_out(self) -> tuple[Disc, ...]:
+        """Where the centre of the block may not be put: every obstacle, and half the block's diagonal around it."""
+        margin_mm = self.config.block.side_mm / math.sqrt(2)
+        return tuple(Disc(each.x_mm, each.y_mm, each.radius_mm + margin_mm) for each in self.config.obstacles)
 
     @cached_property
     def symmetries(self) -> tuple[Symmetry, ...]:
         """The isometries that take the cell onto itself, the identity first."""
-        return symmetries(self.arms, self.graph.edges)
+        return symmetries(self.arms, self.graph.edges, self.keep_out)
 
     @cached_property
     def chart(self) -> Chart:
@@ -152,12 +162,17 @@ class Cell:
 
     def place_mm(self, arm: Array, receiver: Array, alpha: Array, beta: Array) -> Array:
         """World position (..., 2) in mm of chart coordinates in what ``arm`` and ``receiver`` (...) share; NaN where they share nothing."""
-        xp = namespace(alpha)
-        place = xp.stack([alpha * math.nan, beta * math.nan], -1)
-        for (i, j), space in self.graph.edges.items():
-            asked = ((arm == i) & (receiver == j)) | ((arm == j) & (receiver == i))
-            place = one_where(asked, space.to_table(alpha, beta), place)
-        return place
+        if self.num_arms == 2:
+            apart = arm != receiver
+            return one_where(apart, self.shared.to_table(alpha, beta), math.nan * namespace(alpha).stack([alpha, beta], -1))
+        return self.graph.table.to_world(self.edge(arm, receiver), alpha, beta)
+
+    def edge(self, arm: Array, receiver: Array) -> Array:
+        """Row of the graph's table of what ``arm`` and ``receiver`` (...) share, or -1; not of a pair, which has a chart of its own."""
+        number: Array = self.graph.number
+        if isinstance(arm, (np.ndarray, np.generic)):
+            return number[arm, receiver]
+        return number[arm.cpu().numpy(), receiver.cpu().numpy()]
 
     def require_pair(self, what: str) -> None:
         """Raise :class:`TwoArmsOnly` unless the cell has two arms; ``what`` needs them."""
@@ -193,6 +208,20 @@ class Cell:
             yaw = wrap(yaw - xp.atan2(lateral, xp.sqrt(xp.clip(square - lateral * lateral, 1e-12, None))))
         return square, yaw
 
+    def seen(self, position_mm: Array) -> tuple[Array, Array]:
+        """Which arms can place at positions (..., >= 2), and at what base yaw [rad]: bool and float (..., num_arms)."""
+        square, yaw = self.polar(position_mm)
+        reached = self.within(square, yaw)
+        return (reached & self.is_clear(position_mm)[..., None] if self.keep_out else reached), yaw
+
+    def is_clear(self, position_mm: Array) -> Array:
+        """Whether an object may stand at positions (..., >= 2), whoever puts it there: bool (...)."""
+        clear = position_mm[..., 0] == position_mm[..., 0]
+        for disc in self.keep_out:
+            dx, dy = position_mm[..., 0] - disc.x_mm, position_mm[..., 1] - disc.y_mm
+            clear &= dx * dx + dy * dy >= max(disc.radius_mm - REACH_TOLERANCE_MM, 0.0) ** 2
+        return clear
+
     def gripper_yaw(self, yaw_rad: Array) -> Array:
         """World yaw psi of each gripper, (..., num_arms), from base yaws; not wrapped."""
         return yaw_rad + self._constants(yaw_rad)[4]
@@ -204,14 +233,18 @@ class Cell:
 
     def reaches(self, position_mm: Array) -> Array:
         """Which arms can place at positions (..., >= 2): bool (..., num_arms)."""
-        return self.within(*self.polar(position_mm))
+        return self.seen(position_mm)[0]
 
     def require_reached(self, what: str, pose: Array) -> None:
-        """Raise :class:`OutOfReach` unless an arm reaches the pose ``what``, (2,) or (3,) in mm and rad."""
+        """Raise :class:`OutOfReach`, or :class:`BlockedPlace`, unless an arm can put the pose ``what``, (2,) or (3,) in mm and rad."""
         with np.errstate(over="ignore"):  # of absurd coordinates; infinitely far is out of reach too
             reached = bool(self.reaches(np.asarray(pose, float)).any())
         if not reached:
-            raise OutOfReach(what, (float(pose[0]), float(pose[1])), {arm.name: (arm.r_min_mm, arm.r_max_mm) for arm in self.arms})
+            place = float(pose[0]), float(pose[1])
+            for disc in self.keep_out:
+                if math.dist(place, disc[:2]) < disc.radius_mm - REACH_TOLERANCE_MM:
+                    raise BlockedPlace(what, place, disc)
+            raise OutOfReach(what, place, {arm.name: (arm.r_min_mm, arm.r_max_mm) for arm in self.arms})
 
     def clamp_to_workspace(self, pose: Array, slack_mm: float) -> Array:
         """``pose`` (3,) as a supervisor is to see it.

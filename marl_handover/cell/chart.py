@@ -8,20 +8,27 @@ all that matters to the object's orientation.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from marl_handover.arrays import Array, namespace, wrap
-from marl_handover.cell.arm import REACH_TOLERANCE_MM, Arm
+from marl_handover.arrays import Array, Floats, namespace
+from marl_handover.cell.angle_arcs import angle_arcs
+from marl_handover.cell.angle_kernels import PAIR_SIZE, chart_coordinates, middles, place_slopes, places
+from marl_handover.cell.arm import Arm, Disc
 from marl_handover.errors import InvalidSetting, NoSharedSpace
-from marl_handover.geometry.arm_model import Floats
+from marl_handover.geometry.se2 import SE2
 
 
 class Arc(NamedTuple):
-    """An interval of hand-over angles: the lowest angle from the first arm to the second, and the lowest one back, both in [0, 2 pi)."""
+    """An interval of hand-over angles: the lowest angle from the first arm to the second, and the lowest one back.
+
+    Both are in [0, 2 pi), but where the interval contains the angle 0.
+    """
 
     low_rad: float
     back_low_rad: float
@@ -143,299 +150,174 @@ class PaperChart:
         return xp.stack([x_mm, 0 * x_mm], -1)
 
 
-SAMPLES = 4001
-"""Hand-over angles at which the shared space is looked for; a piece between two of them is found where it is widest."""
+class EdgeTable:
+    """What pairs of arms share, one edge a row, for the compiled charts; see :mod:`marl_handover.cell.angle_kernels`.
 
-GAP = 1e-3
-"""Between what two arcs have of alpha: one half of it belongs to the end of either, so that rounding does not change the arc."""
+    Attributes:
+        pairs: (E, 15) geometry of each pair of arms.
+        discs: (E, M, 3) keep-out discs in the frame of the pair; the first ``n_discs`` (E,) of a row are meant.
+        arcs: (E, K, 2) centre and half of each interval of eta; the first ``n_arcs`` (E,) of a row are meant.
+        inset: factor on both chart coordinates.
+    """
 
-_NARROW_MM = 1e-9
-_QUARTER, _STEEP = math.pi / 2, 1.4
+    def __init__(self, pairs: Floats, discs: Sequence[Floats], arcs: Sequence[Floats], inset: float) -> None:
+        self.pairs, self.inset = np.ascontiguousarray(pairs), float(inset)
+        self.discs, self.n_discs = _padded(discs, 3)
+        self.arcs, self.n_arcs = _padded(arcs, 2)
 
-Eta = tuple[float, float]
+    def to_world(self, edge: Array, alpha: Array, beta: Array) -> Array:
+        """World places (..., 2) in mm of chart coordinates (...) on edges (...), with a gradient; NaN where an edge is negative."""
+        out = np.empty((*alpha.shape, 2))
+        rows = _rows(edge, np.int64, alpha.shape), _rows(alpha), _rows(beta)
+        places(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, self.inset, *rows, out.reshape(-1, 2))
+        place = _like(out, alpha)
+        if not (getattr(alpha, "requires_grad", False) or getattr(beta, "requires_grad", False)):
+            return place
+        slopes = np.empty((*alpha.shape, 2, 2))
+        place_slopes(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, self.inset, *rows, slopes.reshape(-1, 2, 2))
+        chart = namespace(alpha).stack([alpha, beta], -1)
+        return place + (_like(slopes, alpha) * (chart - chart.detach())[..., None, :]).sum(-1)  # adds 0, and the gradient
+
+    def from_world(self, edge: Array, position_mm: Array) -> tuple[Array, Array]:
+        """Chart coordinates (alpha, beta), each (...), of world places (..., 2); beyond [-1, 1] where they are not shared."""
+        shape = position_mm.shape[:-1]
+        out, at = np.empty((*shape, 2)), _rows(position_mm).reshape(-1, 2)
+        rows = _rows(edge, np.int64, shape), at
+        chart_coordinates(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, self.inset, *rows, out.reshape(-1, 2))
+        found = _like(out, position_mm)
+        return found[..., 0], found[..., 1]
+
+    def at_angle(self, edge: Array, gamma_rad: Array) -> Array:
+        """World places (..., 2) in the middle of the longest piece of those that have the hand-over angle ``gamma_rad`` (...)."""
+        out = np.empty((*gamma_rad.shape, 2))
+        rows = _rows(edge, np.int64, gamma_rad.shape), _rows(gamma_rad) - math.pi
+        middles(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, *rows, out.reshape(-1, 2))
+        return _like(out, gamma_rad)
+
+
+def _padded(rows: Sequence[Floats], width: int) -> tuple[Floats, NDArray[np.int64]]:
+    """Rows (n_i, width) as one array (E, largest n_i, width), and the n_i."""
+    lengths = np.array([len(row) for row in rows], np.int64)
+    table = np.zeros((len(rows), int(lengths.max(initial=0)), width))
+    for number, row in enumerate(rows):
+        table[number, : len(row)] = row
+    return table, lengths
+
+
+def _rows(values: Array, dtype: type = np.float64, shape: tuple[int, ...] | None = None) -> Any:
+    """Values as one contiguous row of numpy's, broadcast to ``shape``."""
+    array = values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
+    if shape is not None and array.shape != tuple(shape):
+        array = np.broadcast_to(array, shape)
+    return np.ascontiguousarray(array, dtype).reshape(-1)
+
+
+def _like(values: Floats, like: Array) -> Array:
+    """Values as an array of the kind of ``like``."""
+    if isinstance(like, (np.ndarray, np.generic)):
+        return values.astype(like.dtype, copy=False)
+    return namespace(like).from_numpy(values).to(like.device, like.dtype)
+
+
+def pair_row(first: Arm, second: Arm, frame: SE2) -> Floats:
+    """The geometry of two arms (15,) as :mod:`marl_handover.cell.angle_kernels` has it; ``frame`` is that of the pair."""
+    row = np.empty(PAIR_SIZE)
+    row[0] = math.dist(first.base.position_mm, second.base.position_mm)
+    for number, (arm, other, handed) in enumerate(((first, second, 1), (second, first, -1))):
+        row[1 + 2 * number : 3 + 2 * number] = [math.sqrt(max(r * r - arm.lateral_mm**2, 0.0)) for r in (arm.r_min_mm, arm.r_max_mm)]
+        row[5 + number] = arm.lateral_mm
+        ahead = arm.base.to_local(other.base.position_mm)
+        low, high = sorted(handed * (yaw - math.atan2(ahead[1], ahead[0])) for yaw in arm.yaw_rad)
+        whole = high - low > 2 * math.pi - 1e-6
+        row[7 + 2 * number : 9 + 2 * number] = (low + high) / 2, 2 * math.pi if whole else (high - low) / 2
+    row[11:] = frame.x_mm, frame.y_mm, *frame.facing
+    return row
 
 
 @dataclass(frozen=True)
 class AngleChart:
     """The angle chart of any two annulus sectors: alpha is the hand-over angle, beta says where among the places that have it.
 
-    With a_1 and a_2 the angles at the bases from the base line to the grippers' directions, both counted towards +x, the hand-over angle is
-    gamma = pi + eta with eta = a_1 + a_2. ``alpha`` maps onto the arcs of eta by length, a :data:`GAP` between them; ``beta`` maps onto
-    the difference of the distances, second minus first, that the curve of eta offers. Distances are those in the arms' own vertical planes,
-    R = sqrt(rho^2 - delta^2) with the lateral offset delta. With D between the bases, phi = (a_2 - a_1) / 2 and h = eta / 2, the law of
-    sines gives
-
-        R_1 - R_2 = (D sin(phi) - (delta_1 + delta_2) cos(h)) / sin(h)
-        R_1 + R_2 = (D cos(phi) + (delta_1 - delta_2) sin(h)) / cos(h)
-
-    which solved for phi is smooth on the base line, too, where h = 0. As long as neither a_1 nor a_2 passes a quarter turn, R_1 rises and
-    R_2 falls with the difference: each limit of a radius or a yaw is one bound of it, and every curve is in one piece.
+    ``alpha`` maps onto the arcs of hand-over angles by length, a small gap between them; ``beta`` onto the pieces of the curve of an angle,
+    joined, by the angle a_2 at the second base, from the first arm's end (+1) to the second's (-1). A keep-out disc in mid-curve leaves a
+    gap that no coordinates hit. It works for rings, yaw ranges and lateral offsets that differ, and for bases inside each other's ring.
 
     Attributes:
         first, second: the arms.
-        inset: factor on both coordinates, about the middle of each arc and of each curve.
+        inset: factor on both coordinates, about the middle of each arc and of each piece.
+        discs: keep-out discs, in the world.
 
     Raises:
-        NoSharedSpace: they share nothing, or places that one of them sees more than a quarter turn off the base line.
+        NoSharedSpace: they share nothing.
     """
 
     first: Arm
     second: Arm
     inset: float = 1.0
+    discs: tuple[Disc, ...] = ()
 
     def __post_init__(self) -> None:
-        self._require_ahead()
-        if not self._eta_arcs:
-            most = self.first.r_max_mm + self.second.r_max_mm
-            fix = f"stand them less than {most:g} mm apart" if most <= self._distance_mm else "turn them to face each other"
-            raise self._none(f"{self._reach}; they have no place in common: {fix}")
+        if not len(self._arcs):
+            least, most = abs(self.first.r_min_mm - self.second.r_max_mm), self.first.r_max_mm + self.second.r_max_mm
+            reach = [f"{arm.r_min_mm:g} to {arm.r_max_mm:g}" for arm in (self.first, self.second)]
+            rings = f"arms {self.first.name!r} and {self.second.name!r} reach {reach[0]} and {reach[1]} mm"
+            fix = f"stand them less than {most:g} mm apart" if most <= self._row[0] else "turn them to face each other"
+            if self.discs and least < self._row[0] < most:
+                fix = "move the obstacles or turn the arms"
+            reason = f"{rings}; they have no place in common: {fix}"
+            raise NoSharedSpace(float(self._row[0]), self.first.r_min_mm, self.first.r_max_mm, reason)
 
     @property
     def arcs(self) -> tuple[Arc, ...]:
         """All hand-over angles that its places have."""
-        return tuple(Arc(math.pi + c - self.inset * half, math.pi - c - self.inset * half) for c, half in self._eta_arcs)
+        return tuple(Arc(math.pi + c - self.inset * half, math.pi - c - self.inset * half) for c, half in self._arcs.tolist())
 
     @property
     def skew_rad(self) -> float | None:
         """How far the middle of the hand-over angles is above pi; None for several arcs."""
-        return self._eta_arcs[0][0] if len(self._eta_arcs) == 1 else None
+        return float(self._arcs[0, 0]) if len(self._arcs) == 1 else None
 
     def to_table(self, alpha: Array, beta: Array) -> Array:
         """Position (..., 2) in mm, in the chart's frame, of coordinates that are each of shape (...)."""
-        xp = namespace(alpha)
-        if alpha.dtype == xp.float32 and self._is_steep:
-            place = self._on_table(*(part * xp.ones_like(part, dtype=xp.float64) for part in (alpha, beta)))
-            return place.astype(alpha.dtype) if xp is np else place.to(alpha.dtype)
-        return self._on_table(alpha, beta)
-
-    def _on_table(self, alpha: Array, beta: Array) -> Array:
-        xp, arcs = namespace(alpha), self._eta_arcs
-        if len(arcs) == 1:
-            return self._place(arcs[0][0] + alpha * (self.inset * arcs[0][1]), beta)
-        eta = 0 * alpha
-        for (centre, half), middle in zip(arcs, self._middles, strict=True):
-            there = (alpha - middle) * self._stretch
-            eta = xp.where(there >= -half - self._stretch * GAP / 2, centre + self.inset * xp.clip(there, -half, half), eta)
-        return self._place(eta, beta)
+        return self._table.to_world(np.zeros((), int), alpha, beta)
 
     def from_table(self, position_mm: Array) -> tuple[Array, Array]:
         """Coordinates (alpha, beta), each (...), of a position (..., 2) in mm; outside the square where it is outside.
 
         Where a curve is a single point, as at the ends of an arc, beta has no meaning and is 0.
         """
-        xp, arcs = namespace(position_mm), self._eta_arcs
-        (r_1, a_1), (r_2, a_2) = self._seen(position_mm)
-        eta = a_1 + a_2
-        alpha = 0 * eta
-        for number, ((centre, half), middle) in enumerate(zip(arcs, self._middles, strict=True)):
-            begins = -math.inf if number == 0 else (sum(arcs[number - 1]) + centre - half) / 2
-            alpha = xp.where(eta >= begins, middle + (eta - centre) / (self.inset * self._stretch), alpha)
-        low, high = self._bounds(eta)
-        half_mm = self.inset * (high - low) / 2
-        some, one = half_mm > _NARROW_MM, xp.ones_like(eta)
-        beta = ((low + high) / 2 - (r_1 - r_2)) / xp.where(some, half_mm, one)
-        return alpha, xp.where(some, beta, xp.where(half_mm < -_NARROW_MM, 2 * one, 0 * one))
+        return self._table.from_world(np.zeros((), int), position_mm)
 
     def at_angle(self, gamma_rad: Array) -> Array:
-        """A place (..., 2) in the middle of those that have the hand-over angle ``gamma_rad`` (...)."""
-        eta = wrap(gamma_rad - math.pi)
-        return self._place(eta, 0 * eta)
+        """A place (..., 2) in the middle of the longest piece of those that have the hand-over angle ``gamma_rad`` (...)."""
+        return self._table.at_angle(np.zeros((), int), gamma_rad)
 
-    def _place(self, eta: Array, beta: Array) -> Array:
-        """The place (..., 2) at ``beta`` (...) on the curve of ``eta`` (...)."""
-        xp, distance, (delta_1, delta_2) = namespace(eta), self._distance_mm, self._lateral_mm
-        low, high = self._bounds(eta)
-        difference = (low + high) / 2 - self.inset * beta * (high - low) / 2
-        sin_h, cos_h = xp.sin(eta / 2), xp.cos(eta / 2)
-        sin_phi = (difference * sin_h + (delta_1 + delta_2) * cos_h) / distance
-        cos_phi = _cosine(sin_phi)
-        r_1 = ((distance * cos_phi + (delta_1 - delta_2) * sin_h) / cos_h + difference) / 2
-        sin_a, cos_a = sin_h * cos_phi - cos_h * sin_phi, cos_h * cos_phi + sin_h * sin_phi  # of a_1 = h - phi
-        x, y = r_1 * sin_a, distance / 2 - r_1 * cos_a
-        return xp.stack([x + delta_1 * cos_a, y + delta_1 * sin_a] if delta_1 else [x, y], -1)
-
-    def _seen(self, position_mm: Array) -> list[tuple[Array, Array]]:
-        """(R_1, a_1) and (R_2, a_2), each (...), of positions (..., 2)."""
-        xp = namespace(position_mm)
-        x, y, half, seen = position_mm[..., 0], position_mm[..., 1], self._distance_mm / 2, []
-        for ahead, delta in ((half - y, self._lateral_mm[0]), (half + y, -self._lateral_mm[1])):
-            plane = xp.sqrt(xp.clip(x * x + ahead * ahead - delta * delta, 0.0, None))
-            seen.append((plane, wrap(xp.atan2(x, ahead) - xp.atan2(0 * plane + delta, plane))))
-        return seen
-
-    def _bounds(self, eta: Array) -> tuple[Array, Array]:
-        """Lowest and highest difference R_1 - R_2 in mm on the curves of ``eta`` (...)."""
-        low, high = self._radial_bounds(eta)
-        for arm, at_most, limit in self._binding_turns:
-            low, high = self._turned(arm, at_most, limit, eta, low, high)
-        return low, high
-
-    def _radial_bounds(self, eta: Array) -> tuple[Array, Array]:
-        """The same as the radii alone have it."""
-        xp, (first, second) = namespace(eta), self._plane_mm
-        sin, cos = xp.sin(eta), xp.cos(eta)
-        low = xp.maximum(self._difference(0, first[0], sin, cos), self._difference(1, second[1], sin, cos))
-        return low, xp.minimum(self._difference(0, first[1], sin, cos), self._difference(1, second[0], sin, cos))
-
-    def _difference(self, arm: int, radius_mm: float, sin: Array, cos: Array) -> Array:
-        """R_1 - R_2 where one arm is at a limit of its radius; where it cannot be on this side of a quarter turn, as near as it can be."""
-        (delta_1, delta_2), distance = self._lateral_mm, self._distance_mm
-        beside = delta_2 + delta_1 * cos if arm == 0 else -delta_1 - delta_2 * cos
-        radius = radius_mm
-        if radius_mm + abs(delta_1) + abs(delta_2) > distance:
-            radius = namespace(sin).clip(self._farthest(beside, sin), None, radius_mm)
-        across = (radius * sin + beside) / distance
-        other = distance * _cosine(across) - radius * cos + (delta_1 if arm == 0 else -delta_2) * sin
-        return radius - other if arm == 0 else other - radius
-
-    def _farthest(self, beside: Array, sin: Array) -> Array:
-        """The radius at which the other arm sees the curve a quarter turn off the base line."""
-        xp = namespace(sin)
-        return (self._distance_mm - xp.where(sin > 0, beside, -beside)) / xp.clip(abs(sin), 1e-12, None)
-
-    def _turned(self, arm: int, at_most: bool, limit: float, eta: Array, low: Array, high: Array) -> tuple[Array, Array]:
-        """The bounds, with that of a_1 (``arm`` 0) or a_2 at ``limit``."""
-        xp, h = namespace(eta), eta / 2
-        phi = xp.clip(h - limit if arm == 0 else limit - h, -_QUARTER, _QUARTER)
-        sin_h = xp.sin(h)
-        sin_h = xp.where(abs(sin_h) < 1e-12, 1e-12 + 0 * h, sin_h)
-        there = (self._distance_mm * xp.sin(phi) - sum(self._lateral_mm) * xp.cos(h)) / sin_h
-        least = (sin_h > 0) == (at_most == (arm == 0))
-        return xp.where(least, xp.maximum(low, there), low), xp.where(least, high, xp.minimum(high, there))
+    def row_in(self, frame: SE2) -> tuple[Floats, Floats, Floats]:
+        """The row of an :class:`EdgeTable` whose places are in the world: geometry, discs, arcs; ``frame`` is that of the pair."""
+        return pair_row(self.first, self.second, frame), self._discs, self._arcs
 
     @cached_property
-    def _is_steep(self) -> bool:
-        """Whether places are so near to a quarter turn off the base line that single precision would put them beside the ring."""
-        alpha, beta = np.meshgrid(np.linspace(-1, 1, 201), np.linspace(-1, 1, 5))
-        return any(bool((abs(turn) > _STEEP).any()) for _, turn in self._seen(self._on_table(alpha, beta)))
+    def _row(self) -> Floats:
+        return pair_row(self.first, self.second, SE2(0.0, 0.0, (1.0, 0.0)))
 
     @cached_property
-    def _stretch(self) -> float:
-        """Radians of eta for one of alpha."""
-        return sum(half for _, half in self._eta_arcs) / (1 - GAP * (len(self._eta_arcs) - 1) / 2)
+    def _discs(self) -> Floats:
+        """The discs (M, 3) in the pair's frame."""
+        frame = pair_frame(self.first, self.second)
+        return np.array([[*frame.to_local((disc.x_mm, disc.y_mm)), disc.radius_mm] for disc in self.discs]).reshape(-1, 3)
 
     @cached_property
-    def _middles(self) -> list[float]:
-        """Alpha in the middle of each arc."""
-        found, start = [], -1.0
-        for _, half in self._eta_arcs:
-            found.append(start + half / self._stretch)
-            start += 2 * half / self._stretch + GAP
-        return found
+    def _arcs(self) -> Floats:
+        return np.asarray(angle_arcs(self._row, self._discs))
 
     @cached_property
-    def _distance_mm(self) -> float:
-        return math.dist(self.first.base.position_mm, self.second.base.position_mm)
-
-    @cached_property
-    def _lateral_mm(self) -> tuple[float, float]:
-        return self.first.lateral_mm, self.second.lateral_mm
-
-    @cached_property
-    def _plane_mm(self) -> list[tuple[float, float]]:
-        """Least and greatest R of each arm."""
-        return [
-            (math.sqrt(max(arm.r_min_mm**2 - arm.lateral_mm**2, 0.0)), math.sqrt(max(arm.r_max_mm**2 - arm.lateral_mm**2, 0.0)))
-            for arm in (self.first, self.second)
-        ]
-
-    @cached_property
-    def _towards(self) -> tuple[float, float]:
-        """The base yaw at which each arm faces the other's base."""
-        ahead = self.first.base.to_local(self.second.base.position_mm), self.second.base.to_local(self.first.base.position_mm)
-        return math.atan2(ahead[0][1], ahead[0][0]), math.atan2(ahead[1][1], ahead[1][0])
-
-    @cached_property
-    def _turns(self) -> list[tuple[float, float]]:
-        """Least and greatest a_1 and a_2 within a quarter turn; the first is the greater where there are none."""
-        found = []
-        for arm, towards, handed in ((self.first, self._towards[0], 1), (self.second, self._towards[1], -1)):
-            low, high = sorted(handed * (yaw - towards) for yaw in arm.yaw_rad)
-            if high - low > 2 * math.pi - 1e-6:
-                low, high = -math.pi, math.pi
-            pieces = [(max(low + turn, -_QUARTER), min(high + turn, _QUARTER)) for turn in (0.0, 2 * math.pi, -2 * math.pi)]
-            pieces = [(least, most) for least, most in pieces if least < most] or [(_QUARTER, -_QUARTER)]
-            if len(pieces) > 1:
-                raise self._none(f"the gap in the yaw range of arm {arm.name!r} lies within a quarter turn of the base line; turn that arm")
-            found.append(pieces[0])
-        return found
-
-    @cached_property
-    def _binding_turns(self) -> list[tuple[int, bool, float]]:
-        """Arm, whether it is an upper limit, and value of those limits of a_1 and a_2 that cut a curve."""
-        eta = self._sampled
-        limits = [(arm, at_most, self._turns[arm][at_most]) for arm in (0, 1) for at_most in (False, True)]
-        low, high = self._radial_bounds(eta)
-        found = []
-        for arm, at_most, limit in limits:
-            if abs(limit) < _QUARTER - 1e-12 or (limit > 0) != at_most:
-                lower, higher = self._turned(arm, at_most, limit, eta, low, high)
-                if bool(((low < high) & ((lower > low) | (higher < high))).any()):
-                    found.append((arm, at_most, limit))
-        return found
-
-    @cached_property
-    def _sampled(self) -> Floats:
-        return np.linspace(-math.pi, math.pi, SAMPLES + 2)[1:-1]
-
-    def _width_mm(self, eta: Array) -> Array:
-        """How much the difference varies on curves of ``eta`` (...); negative where there is none."""
-        low, high = self._bounds(eta)
-        width = high - low
-        sin, cos, (delta_1, delta_2) = np.sin(eta), np.cos(eta), self._lateral_mm
-        for arm, beside in ((0, delta_2 + delta_1 * cos), (1, -delta_1 - delta_2 * cos)):
-            width = np.minimum(width, self._farthest(beside, sin) - self._plane_mm[arm][0])
-        return width
-
-    @cached_property
-    def _eta_arcs(self) -> tuple[Eta, ...]:
-        """Centre and half of the width of each interval of eta on which there are places."""
-        from scipy.optimize import brentq, minimize_scalar  # here: the paper's chart needs neither, and they take their time to load
-
-        eta = self._sampled
-        width = self._width_mm(eta)
-        for index in np.flatnonzero((width[1:-1] <= 0) & (width[1:-1] > width[:-2]) & (width[1:-1] >= width[2:])) + 1:
-            peak = minimize_scalar(
-                lambda at: -float(self._width_mm(np.float64(at))), bounds=(eta[index - 1], eta[index + 1]), method="bounded"
-            )
-            if -peak.fun > _NARROW_MM:
-                eta, width = np.append(eta, peak.x), np.append(width, -peak.fun)
-        order = np.argsort(eta)
-        eta, inside = eta[order], width[order] > 0
-        ends = np.flatnonzero(inside[1:] != inside[:-1])
-        roots = [float(brentq(lambda at: float(self._width_mm(np.float64(at))), eta[end], eta[end + 1], xtol=1e-15)) for end in ends]
-        arcs = [((low + high) / 2, (high - low) / 2) for low, high in zip(roots[::2], roots[1::2], strict=True)]
-        # What is narrower than the tolerance of reach is no place.
-        return tuple(arc for arc in arcs if self._width_mm(arc[0] + arc[1] * np.linspace(-0.9, 0.9, 19)).max() > REACH_TOLERANCE_MM)
-
-    def _require_ahead(self) -> None:
-        """Raise :class:`NoSharedSpace` for a common place that an arm sees more than a quarter turn off the base line."""
-        distance = self._distance_mm
-        for arm in (self.first, self.second):
-            radius, angle = np.meshgrid(np.linspace(arm.r_min_mm, arm.r_max_mm, 65), np.linspace(-math.pi, math.pi, 361))
-            sign = -1 if arm is self.first else 1
-            points = np.stack([radius * np.sin(angle), sign * (radius * np.cos(angle) - distance / 2)], -1)
-            shared, far = np.ones(radius.shape, bool), np.zeros(radius.shape, bool)
-            places = zip(self._seen(points), self._plane_mm, (self.first, self.second), self._towards, (1, -1), strict=True)
-            for (plane, turn), (least, most), reaching, towards, handed in places:
-                yaw = wrap(towards + handed * turn)
-                shared &= (plane >= least) & (plane <= most) & (yaw >= reaching.yaw_rad[0]) & (yaw <= reaching.yaw_rad[1])
-                far |= abs(turn) > _QUARTER + 1e-9
-            if (shared & far).any():
-                radii = [(each.r_min_mm, each.r_max_mm) for each in (self.first, self.second)]
-                apart = math.sqrt(max(radii[0][1] ** 2 - radii[1][0] ** 2, radii[1][1] ** 2 - radii[0][0] ** 2))
-                raise self._none(f"{self._reach}; {arm.name!r} is too near the other base: {apart:.0f} mm between the bases are enough")
-
-    @property
-    def _reach(self) -> str:
-        reach = [f"{arm.r_min_mm:g} to {arm.r_max_mm:g}" for arm in (self.first, self.second)]
-        return f"arms {self.first.name!r} and {self.second.name!r} reach {reach[0]} and {reach[1]} mm"
-
-    def _none(self, reason: str) -> NoSharedSpace:
-        return NoSharedSpace(self._distance_mm, self.first.r_min_mm, self.first.r_max_mm, reason)
+    def _table(self) -> EdgeTable:
+        return EdgeTable(self._row[None], [self._discs], [self._arcs], self.inset)
 
 
-def _cosine(sine: Array) -> Array:
-    """The cosine, not negative, of angles with this sine (...); its slope is finite everywhere."""
-    xp = namespace(sine)
-    return xp.sqrt(xp.clip(1 - sine * sine, 1e-30, None))
+def pair_frame(first: Arm, second: Arm) -> SE2:
+    """The frame of a pair: its origin lies midway between the bases, +y points to the first one."""
+    one, other = first.base.position_mm, second.base.position_mm
+    x_mm, y_mm = (one + other) / 2
+    up = (one - other) / math.dist(one, other)
+    return SE2(float(x_mm), float(y_mm), (float(up[1]), float(-up[0])))

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from marl_handover.arrays import Array, namespace
-from marl_handover.cell.arm import Arm
-from marl_handover.cell.chart import AngleChart, Chart, PaperChart
-from marl_handover.errors import NoSharedSpace
+from marl_handover.cell.arm import Arm, Disc
+from marl_handover.cell.chart import AngleChart, Chart, EdgeTable, PaperChart, pair_frame
+from marl_handover.errors import InvalidSetting, NoSharedSpace
 from marl_handover.geometry.se2 import SE2
 
 
@@ -34,6 +35,21 @@ class HandoverGraph:
         return tuple(other for other in range(len(self.names)) if (min(arm, other), max(arm, other)) in self.edges)
 
     @cached_property
+    def table(self) -> EdgeTable:
+        """The angle charts of all edges, in the order of :attr:`edges`."""
+        rows = [space.angle_chart.row_in(space.frame) for space in self.edges.values()]
+        pairs, discs, arcs = zip(*rows, strict=True)
+        return EdgeTable(np.stack(pairs), discs, arcs, next(iter(self.edges.values())).inset)
+
+    @cached_property
+    def number(self) -> NDArray[np.int64]:
+        """Row of :attr:`table` of what arms i and j share, either way round (num_arms, num_arms); -1 where they share nothing."""
+        number = np.full((len(self.names), len(self.names)), -1)
+        for row, (i, j) in enumerate(self.edges):
+            number[i, j] = number[j, i] = row
+        return number
+
+    @cached_property
     def components(self) -> tuple[tuple[int, ...], ...]:
         """Arms between which an object can travel, group by group."""
         count = len(self.names)
@@ -49,9 +65,6 @@ class HandoverGraph:
         return len(self.components) == 1
 
 
-SAMPLES = 65
-"""Radii of each arm at which a shared space is looked for: a piece narrower than about 2 mm is no place to hand anything over."""
-
 _ALIKE_MM = 1e-6
 
 
@@ -63,13 +76,15 @@ class SharedSpace:
         first: an arm of the cell.
         second: another one.
         inset: part of the chart that is in use.
-        charted: ``paper``, ``angle``, or None: the paper's where both arms have the same ring, else by hand-over angles.
+        charted: ``paper``, ``angle``, or None: the paper's where both arms have the same ring, if it can be, else by hand-over angles.
+        discs: where nothing may be put.
     """
 
     first: Arm
     second: Arm
     inset: float = 1.0
     charted: str | None = None
+    discs: tuple[Disc, ...] = ()
 
     @property
     def base_distance_mm(self) -> float:
@@ -79,23 +94,23 @@ class SharedSpace:
     @cached_property
     def frame(self) -> SE2:
         """The frame of the chart: its origin lies midway between the bases, +y points to the first one."""
-        one, other = self.first.base.position_mm, self.second.base.position_mm
-        x_mm, y_mm = (one + other) / 2
-        up = (one - other) / self.base_distance_mm
-        return SE2(float(x_mm), float(y_mm), (float(up[1]), float(-up[0])))
+        return pair_frame(self.first, self.second)
 
     @cached_property
     def is_empty(self) -> bool:
         """Whether there is no such place."""
-        distance = self.base_distance_mm
-        r_1 = np.linspace(self.first.r_min_mm, self.first.r_max_mm, SAMPLES)[:, None, None]
-        r_2 = np.linspace(self.second.r_min_mm, self.second.r_max_mm, SAMPLES)[None, :, None]
-        # Circles around both bases meet at two points of the frame, on either side of the base line.
-        y = (r_2**2 - r_1**2) / (2 * distance)
-        square = r_1**2 - (distance / 2 - y) ** 2
-        x = np.sqrt(np.maximum(square, 0.0)) * np.array([-1.0, 1.0])
-        points = self.frame.to_world(np.stack(np.broadcast_arrays(x, y), axis=-1))
-        return not bool(((square >= 0) & self.first.reaches(points) & self.second.reaches(points)).any())
+        if self.base_distance_mm >= self.first.r_max_mm + self.second.r_max_mm:
+            return True
+        try:
+            _ = self.angle_chart
+        except NoSharedSpace:
+            return True
+        return False
+
+    @cached_property
+    def angle_chart(self) -> AngleChart:
+        """The chart by hand-over angles, in :attr:`frame`. Raises :class:`NoSharedSpace` where there is no place."""
+        return AngleChart(self.first, self.second, self.inset, self.discs)
 
     @cached_property
     def chart(self) -> Chart:
@@ -108,12 +123,21 @@ class SharedSpace:
         one, other = self.first, self.second
         alike = max(abs(one.r_min_mm - other.r_min_mm), abs(one.r_max_mm - other.r_max_mm)) < _ALIKE_MM
         alike &= one.lateral_mm == other.lateral_mm == 0
-        if self.charted == "angle" or (self.charted is None and not alike):
-            return AngleChart(one, other, self.inset)
-        if not alike:
-            reach = f"arms {one.name!r} and {other.name!r} reach {one.r_min_mm:g} to {one.r_max_mm:g} and {other.r_min_mm:g} to "
-            reason = f"{reach}{other.r_max_mm:g} mm; cell.chart=paper needs equal rings and no lateral offset, cell.chart=angle does not"
-            raise NoSharedSpace(self.base_distance_mm, one.r_min_mm, one.r_max_mm, reason)
+        if self.charted == "angle" or (self.charted is None and (not alike or self.discs)):
+            return self.angle_chart
+        if self.charted is None:
+            try:
+                lens = self._lens()
+                _ = lens.arcs
+            except (NoSharedSpace, InvalidSetting) as error:
+                if self.is_empty:
+                    raise error from None
+                return self.angle_chart
+            return lens
+        reach = f"arms {one.name!r} and {other.name!r} reach {one.r_min_mm:g} to {one.r_max_mm:g} and {other.r_min_mm:g} to "
+        reach += f"{other.r_max_mm:g} mm; cell.chart=paper needs equal rings, no lateral offset and no obstacles, cell.chart=angle does not"
+        if not alike or self.discs:
+            raise NoSharedSpace(self.base_distance_mm, one.r_min_mm, one.r_max_mm, reach)
         return self._lens()
 
     def _lens(self) -> PaperChart:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from marl_handover.arrays import Array, namespace, wrap
-from marl_handover.cell.arm import Arm
+from marl_handover.cell.arm import Arm, Disc
 from marl_handover.cell.shared_space import SharedSpace
 
 NO_ARM, LEFT, RIGHT = -1, 0, 1
@@ -126,8 +126,8 @@ class Symmetry:
         return Symmetry(_exact(S @ R), (float(shift[0]), float(shift[1])), tuple(other.arms[arm] for arm in self.arms), signs)
 
 
-def symmetries(arms: Sequence[Arm], spaces: Mapping[tuple[int, int], SharedSpace]) -> tuple[Symmetry, ...]:
-    """All symmetries of arms that share ``spaces``, the identity first."""
+def symmetries(arms: Sequence[Arm], spaces: Mapping[tuple[int, int], SharedSpace], discs: Sequence[Disc] = ()) -> tuple[Symmetry, ...]:
+    """All symmetries of arms that share ``spaces``, with keep-out ``discs``, the identity first."""
     found = []
     for image in range(len(arms)):
         for handed in (1.0, -1.0):
@@ -135,9 +135,15 @@ def symmetries(arms: Sequence[Arm], spaces: Mapping[tuple[int, int], SharedSpace
             R = arms[image].base.rotation() @ np.diag([1.0, handed]) @ arms[0].base.rotation().T
             shift = arms[image].base.position_mm - R @ arms[0].base.position_mm
             permutation = [_image(arm, arms, R, shift, handed) for arm in arms]
-            if None not in permutation and len(set(permutation)) == len(arms):
+            if None not in permutation and len(set(permutation)) == len(arms) and _maps(discs, R, shift):
                 found.append(_symmetry(R, shift, tuple(permutation), spaces))  # type: ignore[arg-type]
     return tuple(sorted(found, key=lambda one: (-one.matrix[0][0], -one.matrix[1][1])))
+
+
+def _maps(discs: Sequence[Disc], R: np.ndarray, shift: np.ndarray) -> bool:
+    """Whether an isometry takes every disc onto one of them."""
+    images = [(*(R @ np.array(disc[:2]) + shift), disc.radius_mm) for disc in discs]
+    return all(any(np.abs(np.subtract(image, disc)).max() < _SAME_MM for disc in discs) for image in images)
 
 
 def _symmetry(R: np.ndarray, shift: np.ndarray, arms: tuple[int, ...], spaces: Mapping[tuple[int, int], SharedSpace]) -> Symmetry:

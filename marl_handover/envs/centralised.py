@@ -23,9 +23,9 @@ class MotionCommand(Command):
 
     motion: Array
 
-    def __new__(cls, final: Array, arm: Array, place_mm: Array, motion: Array) -> MotionCommand:
+    def __new__(cls, final: Array, arm: Array, place_mm: Array, receiver: Array, motion: Array) -> MotionCommand:
         """As :class:`Command`, and the motion's numbers."""
-        command = super().__new__(cls, final, arm, place_mm)
+        command = super().__new__(cls, final, arm, place_mm, receiver)
         command.motion = motion
         return command
 

@@ -116,11 +116,10 @@ def _relative(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsil
     scale = max(arm.r_max_mm for arm in cell.arms)
     views, space, skew = cell.views, cell.shared, cell.chart.skew_rad
     at, goal_at = space.in_frame(pose), space.in_frame(goal)
-    square, yaw = cell.polar(pose)
+    reached, yaw = cell.seen(pose)
     one = xp.ones_like(yaw)
-    goal_square, goal_yaw = cell.polar(goal)
-    reach = cell.within(square, yaw) + 0.0 * yaw
-    goal_reach = cell.within(goal_square, goal_yaw) + 0.0 * yaw
+    goal_reached, goal_yaw = cell.seen(goal)
+    reach, goal_reach = reached + 0.0 * yaw, goal_reached + 0.0 * yaw
     mirror = xp.stack([view.turn_sign + 0 * pose[..., 0] for view in views], -1)
     across, along = one, mirror
     if any(view.x_sign < 0 for view in views):

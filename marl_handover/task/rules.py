@@ -15,6 +15,7 @@ from typing import NamedTuple
 from marl_handover.arrays import Array, length, namespace, one_where, select, wrap
 from marl_handover.cell.arm import REACH_TOLERANCE_MM
 from marl_handover.cell.cell import Cell
+from marl_handover.cell.symmetry import NO_ARM
 from marl_handover.config import TaskConfig
 
 MotionCost = Callable[[Cell, Array, Array, Array], Array]
@@ -35,11 +36,15 @@ class Outcome(IntEnum):
 
 
 class Command(NamedTuple):
-    """A decoded action: ``final`` bool (...), ``arm`` int (...), ``place_mm`` (..., 2)."""
+    """A decoded action: ``final`` bool (...), ``arm`` int (...), ``place_mm`` (..., 2), ``receiver`` int (...).
+
+    The place lies in what arm and receiver share; of a final transfer receiver and place mean nothing.
+    """
 
     final: Array
     arm: Array
     place_mm: Array
+    receiver: Array = NO_ARM
 
 
 class Verdict(NamedTuple):
@@ -132,12 +137,11 @@ class Rules:
 
     def finishing(self, pose: Array, goal: Array, epsilon_rad: Array | float | None = None) -> Finishing:
         """What each arm would do to the object by taking it to the goal now."""
-        square, yaw = self.cell.polar(pose)
-        goal_square, goal_yaw = self.cell.polar(goal)
+        reached, yaw = self.cell.seen(pose)
+        goal_reached, goal_yaw = self.cell.seen(goal)
         turn = goal_yaw - yaw
         error = self.orientation_error(pose[..., 2:3] + turn, goal[..., 2:3])
-        reach = self.cell.within(square, yaw) & self.cell.within(goal_square, goal_yaw)
-        return Finishing(reach & (abs(error) <= self._epsilon(epsilon_rad)), error, turn)
+        return Finishing(reached & goal_reached & (abs(error) <= self._epsilon(epsilon_rad)), error, turn)
 
     def finishing_error(self, pose: Array, goal: Array) -> Array:
         """Orientation error each arm would leave if it took the object to the goal now: rad, (..., num_arms). Ignores reach."""
@@ -161,19 +165,19 @@ class Rules:
         alpha, beta = xp.clip(action[..., -2], -1.0, 1.0), xp.clip(action[..., -1], -1.0, 1.0)
         if count == 2:
             arm = xp.where(action[..., 1] > 0, 1, 0)
-            return Command(final, arm, self.cell.graph.edges[(0, 1)].to_table(alpha, beta))
+            return Command(final, arm, self.cell.graph.edges[(0, 1)].to_table(alpha, beta), 1 - arm)
         arm, receiver = xp.argmax(action[..., 1 : 1 + count], -1), xp.argmax(action[..., 1 + count : 1 + 2 * count], -1)
-        return Command(final, arm, self.cell.place_mm(arm, receiver, alpha, beta))
+        return Command(final, arm, self.cell.place_mm(arm, receiver, alpha, beta), receiver)
 
     def transfer(self, pose: Array, goal: Array, command: Command) -> tuple[Array, Array]:
         """Where a command takes the object on exact hardware, and whether the arm can do it: ((..., 3), bool (...)).
 
         theta' = theta + psi_b(p') - psi_b(p). A refused transfer leaves the object where it is.
         """
-        square, yaw = self.cell.polar(pose)
+        reached, yaw = self.cell.seen(pose)
         target = one_where(command.final, goal[..., :2], command.place_mm)
-        target_square, target_yaw = self.cell.polar(target)
-        feasible = select(self.cell.within(square, yaw) & self.cell.within(target_square, target_yaw), command.arm)
+        target_reached, target_yaw = self.cell.seen(target)
+        feasible = select(reached & target_reached, command.arm)
         moved = carried(pose, target, select(target_yaw - yaw, command.arm))
         return one_where(feasible, moved, pose), feasible
 

@@ -154,10 +154,7 @@ def test_gradients_are_finite_on_the_whole_square():
     assert torch.isfinite(slope).all()
 
 
-@pytest.mark.parametrize(
-    ("share", "words"), [(0.2, "too near the other base: .* mm between the bases are enough"), (1.1, "they have no place in common")]
-)
-def test_arms_without_such_a_space_are_named(share, words):
+def test_arms_without_such_a_space_are_named():
     sector = (100.0, 200.0, 0.0, 3.1, 3.1, 0.0)
-    with pytest.raises(NoSharedSpace, match=f"arms 'a' and 'b' reach 100 to 300 and 100 to 300 mm; .*{words}"):
-        _ = SharedSpace(*pair(sector, sector, share), 1.0, "angle").chart
+    with pytest.raises(NoSharedSpace, match="arms 'a' and 'b' reach 100 to 300 and 100 to 300 mm; they have no place in common"):
+        _ = SharedSpace(*pair(sector, sector, 1.1), 1.0, "angle").chart

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from marl_handover.cell import build_cell, cell_config, load_cell
+from marl_handover.cell import AngleChart, build_cell, cell_config, load_cell
 from marl_handover.cli import main
 from marl_handover.config import BlockConfig, CellConfig, MotionConfig
 from marl_handover.errors import CorruptFile, HandoverError, InvalidSetting, MissingFile, NoSharedSpace, UnknownChoice
@@ -106,7 +106,14 @@ def test_hands_close_on_the_pin_wherever_a_block_is_carried(changes, name):
 @pytest.mark.parametrize("distance_mm", [200.0, 300.0, 460.0, 900.0])
 def test_bases_without_a_shared_space_are_named(distance_mm):
     with pytest.raises(NoSharedSpace, match=rf"base_distance_mm = {distance_mm:g}.*between 300 and 460"):
-        build_cell(replace(PAPER, base_distance_mm=distance_mm))
+        build_cell(replace(PAPER, base_distance_mm=distance_mm, chart="paper"))
+
+
+@pytest.mark.parametrize("distance_mm", [200.0, 300.0])
+def test_bases_too_near_for_the_papers_chart_have_that_of_hand_over_angles(distance_mm):
+    assert isinstance(build_cell(replace(PAPER, base_distance_mm=distance_mm)).cell.chart, AngleChart)
+    with pytest.raises(NoSharedSpace, match="between 300 and 460"):
+        build_cell(replace(PAPER, base_distance_mm=460.0))
 
 
 def test_a_yaw_range_too_narrow_for_the_tips_is_named():
@@ -117,7 +124,8 @@ def test_a_yaw_range_too_narrow_for_the_tips_is_named():
             assert build_cell(config).cell.yaw_rad[1] < math.radians(limit) + 1e-9
         else:
             with pytest.raises(NoSharedSpace, match=r"38\.5 deg"):
-                build_cell(config)
+                build_cell(replace(config, chart="paper"))
+            assert isinstance(build_cell(config).cell.chart, AngleChart)
 
 
 def test_a_missing_urdf_is_named(tmp_path):

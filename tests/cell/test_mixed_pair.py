@@ -62,8 +62,9 @@ def test_a_ring_too_small_for_any_distance_is_one_line():
     with pytest.raises(
         NoSharedSpace, match=r"none works for these rings \(left 228 to 230 and right 228 to 230 mm\); choose another"
     ) as caught:
-        build_cell(replace(COARSE, r_min_mm=228.0))
+        build_cell(replace(COARSE, r_min_mm=228.0, chart="paper"))
     assert len(str(caught.value)) < 300
+    assert build_cell(replace(COARSE, r_min_mm=228.0)).cell.chart.arcs
 
 
 def test_out_of_reach_names_the_ring_of_each():
@@ -129,5 +130,7 @@ def test_a_space_in_two_pieces_that_is_not_its_own_mirror_image_is_not_folded():
 def test_what_needs_the_papers_chart_says_so():
     with pytest.raises(InvalidSetting, match=r"cell\.chart = 'angle': must be 'paper', which takes two arms with the same ring, for DQN"):
         load_cell(MIXED).paper_chart("DQN")
-    with pytest.raises(NoSharedSpace, match=r"cell\.chart=paper needs equal rings and no lateral offset, cell\.chart=angle does not"):
+    with pytest.raises(
+        NoSharedSpace, match=r"cell\.chart=paper needs equal rings, no lateral offset and no obstacles, cell\.chart=angle does not"
+    ):
         build_cell(replace(MIXED, chart="paper"))

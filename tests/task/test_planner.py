@@ -232,10 +232,11 @@ def test_intervals_by_hand(paper, rules_of):
     assert planner.interval((LEFT, RIGHT, LEFT, RIGHT)) == pytest.approx((2 * low - high, 2 * high - low))
 
 
-def test_cells_for_which_it_would_not_be_exact_are_refused(rules_of):
-    """A shared space that reaches behind the bases has smaller hand-over angles than at its tips."""
+def test_charts_for_which_it_would_not_be_exact_are_refused(rules_of):
+    """A shared space that reaches behind the bases has smaller hand-over angles than at its tips; the angle chart has them all."""
     cell = load_cell("al5a")
     arms = [replace(arm, base=base, r_min_mm=100.0) for arm, base in zip(cell.arms, mirrored_pair(250.0), strict=True)]
-    wide = replace(cell, arms=tuple(arms), config=replace(cell.config, base_distance_mm=250.0))
+    wide = replace(cell, arms=tuple(arms), config=replace(cell.config, base_distance_mm=250.0, chart="paper"))
     with pytest.raises(InvalidSetting, match=r"base_distance_mm = 250\.0: must be at least 296\.6"):
         ExactPlanner(rules_of(wide))
+    assert ExactPlanner(rules_of(replace(wide, config=replace(wide.config, chart=None)))).walks
