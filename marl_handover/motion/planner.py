@@ -54,6 +54,9 @@ class MotionPlanner:
         self.model, self.motion = model, motion or MotionConfig()
         self.motion.validate()
         model.cell.require_grip(self.motion.finger_travel_mm)
+        if model.cell.keep_out:
+            count = len(model.cell.keep_out)
+            raise InvalidSetting("cell.obstacles", f"{count} of them", "none where arms move: motions do not go around obstacles yet")
         self.homes_rad = parked_poses(model, self.motion)
         self.collision_models = collision_models(model, self.motion)
         self.clearance_mm = np.array([self.motion.self_clearance_mm, self.motion.ground_clearance_mm])
