@@ -105,12 +105,12 @@ class ExactPlanner:
         turn = goal[..., 2] - pose[..., 2]
         shape, count = tuple(turn.shape), cell.num_arms
         out, fit = np.empty((*shape, 3), np.int64), np.empty((*shape, 2))
-        reached: Any = [_numpy(each, bool).reshape(-1, count) for each in (start_in, goal_in)]
-        yaws = [_numpy(cell.gripper_yaw(each), float).reshape(-1, count) for each in (yaw, goal_yaw)]
+        starts, goals = (_numpy(each, bool).reshape(-1, count) for each in (start_in, goal_in))
+        psi, goal_psi = (_numpy(cell.gripper_yaw(each), float).reshape(-1, count) for each in (yaw, goal_yaw))
         turns = _numpy(turn, float).reshape(-1)
         epsilons = np.broadcast_to(_numpy(epsilon, float).reshape(shape if np.ndim(epsilon) else ()), shape).reshape(-1).copy()
-        ways: Any = self._low, self._high, self._start, self._period
-        shortest(*reached, *yaws, turns, epsilons, *ways, out.reshape(-1, 3), fit.reshape(-1, 2))
+        ways = self._low, self._high, self._start, self._period
+        shortest(starts, goals, psi, goal_psi, turns, epsilons, *ways, out.reshape(-1, 3), fit.reshape(-1, 2))
         if isinstance(pose, (np.ndarray, np.generic)):
             return Plan(out[..., 0], out[..., 1], out[..., 2], *fit.astype(pose.dtype, copy=False).transpose(-1, *range(len(shape))))
         xp = namespace(pose)
