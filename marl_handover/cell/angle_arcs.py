@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from marl_handover.cell.angle_kernels import Floats, fibre, in_a_disc, seen, turned_away, wrapped
+from marl_handover.cell.angle_kernels import Floats, fibre, is_shared, seen, wrapped
 from marl_handover.compiled import compiled
 
 TANGENT_SAMPLES = 180
@@ -14,17 +14,6 @@ TANGENT_SAMPLES = 180
 
 _SAME_RAD = 1e-13
 _WITHIN_MM = 1e-6
-
-
-@compiled
-def _inside(pair: Floats, discs: Floats, x: float, y: float) -> bool:
-    """Whether a place is shared, to 1 nm."""
-    r_1, a_1, r_2, a_2 = seen(pair, x, y)
-    if r_1 < pair[1] - _WITHIN_MM or r_1 > pair[2] + _WITHIN_MM or r_2 < pair[3] - _WITHIN_MM or r_2 > pair[4] + _WITHIN_MM:
-        return False
-    if turned_away(a_1, pair[7], pair[8] + _WITHIN_MM / r_1) or turned_away(a_2, pair[9], pair[10] + _WITHIN_MM / r_2):
-        return False
-    return not in_a_disc(discs, x, y, _WITHIN_MM)
 
 
 @compiled
@@ -38,7 +27,7 @@ def _touching(pair: Floats, circle: Floats, angle: float) -> float:
 @compiled
 def _add(pair: Floats, discs: Floats, x: float, y: float, found: Floats, count: int) -> int:
     """Note the eta of a place, if it is shared."""
-    if count < len(found) and _inside(pair, discs, x, y):
+    if count < len(found) and is_shared(pair, discs, x, y, _WITHIN_MM):
         _, a_1, _, a_2 = seen(pair, x, y)
         found[count] = wrapped(a_1 + a_2)
         return count + 1

@@ -39,7 +39,9 @@ _LEAST_RAD, _LEAST_BESIDE_RAD = 1e-12, 1e-7
 """How near to 0 and pi eta is told from them: without lateral offsets, and with, which cost digits there."""
 
 _STRAIGHT_RAD = 1e-2
-_EDGE_MM = 1e-5
+_EDGE_MM = 1e-6
+NEAR_MM = 2e-3
+"""A place this near to a shared one has the coordinates of the nearest piece's end: twice the tolerance of reach."""
 
 
 @compiled
@@ -53,12 +55,8 @@ def _split(pair: Floats, eta: float) -> tuple[float, float, float, float]:
     """The sign of eta, and its absolute value e, pi - e and sin(e), none of which is 0."""
     least = _LEAST_BESIDE_RAD if pair[5] != 0.0 or pair[6] != 0.0 else _LEAST_RAD
     sign = 1.0 if eta >= 0.0 else -1.0
-    e = min(abs(eta), math.pi)
-    rest = math.pi - e
-    if e < least:
-        e, rest = least, math.pi - least
-    elif rest < least:
-        e, rest = math.pi - least, least
+    e = min(max(abs(eta), least), math.pi - least)
+    rest = math.pi - e  # without rounding, where it is small
     return sign, e, rest, math.sin(min(e, rest))
 
 
@@ -101,7 +99,7 @@ def in_a_disc(discs: Floats, x: float, y: float, less: float) -> bool:
 def _allowed(pair: Floats, discs: Floats, sign: float, e: float, sin_e: float, side: int, a: float, low: float, high: float) -> bool:
     """Whether the place at ``a`` is admissible; ``low`` and ``high`` bound the sine of the other angle e - a."""
     b = e - a
-    sine = math.sin(b)
+    sine = math.sin(b) if e < 2.0 else math.sin(math.pi - e + a)
     if sine < low or sine > high:
         return False
     a_1, a_2 = (b, a) if side == 0 else (a, b)
@@ -387,11 +385,11 @@ def coordinates(
     """Chart coordinates (alpha, beta) of a place of the pair's frame; beyond [-1, 1]^2 where it is outside."""
     r_1, a_1, r_2, a_2 = seen(pair, x, y)
     eta = wrapped(a_1 + a_2)
-    unit, start, alpha, nearest = stretch(arcs, count), -1.0, 0.0, math.inf
+    unit, start, alpha, nearest, taken = stretch(arcs, count), -1.0, 0.0, math.inf, 0
     for arc in range(count):
         offset = wrapped(eta - arcs[arc, 0])
         if abs(offset) - arcs[arc, 1] < nearest:
-            nearest = abs(offset) - arcs[arc, 1]
+            nearest, taken = abs(offset) - arcs[arc, 1], arc
             alpha = start + (arcs[arc, 1] + offset / inset) / unit
         start += 2 * arcs[arc, 1] / unit + GAP
     sign, e, _, sin_e = _split(pair, eta)
@@ -405,20 +403,50 @@ def coordinates(
     a = _arcsine(((r_1 if side == 0 else r_2) * sin_e + adds[side]) / pair[0])
     if a > e / 2:
         side, a = 1 - side, e - a
-    pieces = fibre(pair, discs, eta, out, edges)
-    total = _length(out, pieces)
-    if total * pair[0] <= 1e-9 * sin_e:
-        return alpha, 0.0 if nearest < 1e-6 else OUTSIDE
-    reached, edge = 0.0, _EDGE_MM * sin_e / pair[0]
-    at = math.nan
-    for number in range(pieces):
-        begin, end = out[number, 1], out[number, 2]
-        if int(out[number, 0]) == side and min(begin, end) - edge <= a <= max(begin, end) + edge:
-            middle = (begin + end) / 2
-            at = reached + abs(middle - begin) + (a - middle) / inset * (1.0 if end > begin else -1.0)
-            break
+    there = min(arcs[taken, 1], max(-arcs[taken, 1], wrapped(eta - arcs[taken, 0])))
+    _, pieces = _found_fibre(pair, discs, arcs[taken, 0] + there, arcs[taken], out, edges)
+    beta = _along(out, pieces, inset, side, a, e, _EDGE_MM * sin_e / pair[0])
+    if math.isnan(beta):
+        beta = _along(out, pieces, inset, side, a, e, math.inf) if is_shared(pair, discs, x, y, NEAR_MM) else OUTSIDE
+    return alpha, beta
+
+
+@compiled
+def _along(pieces: Floats, count: int, inset: float, side: int, a: float, e: float, edge: float) -> float:
+    """Beta of the coordinate ``a`` of a side; NaN if it lies more than ``edge`` rad beside all pieces, else on the nearest."""
+    total = _length(pieces, count)
+    nearest, reached, at = edge, 0.0, math.nan
+    own = a if side == 0 else e - a
+    for number in range(count):
+        begin, end = pieces[number, 1], pieces[number, 2]
+        low, high = (begin, end) if pieces[number, 0] == 0.0 else (e - begin, e - end)
+        beside = max(low - own, own - high)
+        if int(pieces[number, 0]) == side:
+            beside = max(min(begin, end) - a, a - max(begin, end))
+        if beside <= nearest:
+            nearest = beside
+            if beside <= 0.0 and int(pieces[number, 0]) == side:
+                middle = (begin + end) / 2
+                at = reached + abs(middle - begin) + (a - middle) / inset * (1.0 if end > begin else -1.0)
+            else:
+                at = reached + (0.0 if own < low else abs(end - begin))
         reached += abs(end - begin)
-    return alpha, OUTSIDE if math.isnan(at) else 1.0 - 2.0 * at / total
+    if math.isnan(at):
+        return at
+    return 1.0 - 2.0 * at / total if total > 0.0 else 0.0
+
+
+@compiled
+def is_shared(pair: Floats, discs: Floats, x: float, y: float, tolerance_mm: float) -> bool:
+    """Whether a place is shared, or at most about ``tolerance_mm`` beside what is."""
+    r_1, a_1, r_2, a_2 = seen(pair, x, y)
+    if r_1 < pair[1] - tolerance_mm or r_1 > pair[2] + tolerance_mm or r_2 < pair[3] - tolerance_mm or r_2 > pair[4] + tolerance_mm:
+        return False
+    if turned_away(a_1, pair[7], pair[8] + tolerance_mm / max(r_1, 1.0)) or turned_away(
+        a_2, pair[9], pair[10] + tolerance_mm / max(r_2, 1.0)
+    ):
+        return False
+    return not in_a_disc(discs, x, y, tolerance_mm)
 
 
 @compiled

@@ -49,7 +49,8 @@ def layout_cell(arms: Sequence[Mapping[str, Any]], obstacles: Sequence[Mapping[s
     discs = [_obstacle(f"obstacles[{number}]", record) for number, record in enumerate(obstacles)]
     named = [ArmConfig(arm.name, arm.base.x_mm, arm.base.y_mm, math.degrees(arm.base.facing_rad)) for arm in listed]
     base = CellConfig() if config is None else config
-    return Cell(tuple(listed), replace(base, name="layout", arms=named, obstacles=discs, chart=None, base_distance_mm=None))
+    chart = "angle" if base.chart == "angle" else None
+    return Cell(tuple(listed), replace(base, name="layout", arms=named, obstacles=discs, chart=chart, base_distance_mm=None))
 
 
 def _require_list(what: str, records: Any, least: int, most: int) -> None:
