@@ -429,7 +429,7 @@ def _along(pieces: Floats, count: int, inset: float, side: int, a: float, e: flo
                 middle = (begin + end) / 2
                 at = reached + abs(middle - begin) + (a - middle) / inset * (1.0 if end > begin else -1.0)
             else:
-                at = reached + (0.0 if own < low else abs(end - begin))
+                at = reached + (0.0 if abs(own - low) < abs(own - high) else abs(end - begin))
         reached += abs(end - begin)
     if math.isnan(at):
         return at
