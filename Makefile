@@ -15,6 +15,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 RUN := $(BIN)/marl-handover
 WORKERS ?= 2
+# Each worker has a run of neighbouring tests, whose fixtures it makes once, and takes over some of the other's when it is through.
+PYTEST := -m pytest -q -n $(WORKERS) --dist worksteal
 # Two workers on two cores: let no numerical library start threads of its own in each.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
@@ -48,7 +50,7 @@ demo: $(STAMP)
 	@echo "The run, its evaluation and the pictures are in runs/demo"
 
 test: $(STAMP)
-	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS)
+	$(ONE_THREAD) $(BIN)/python $(PYTEST)
 
 # In .venv first, then with every other Python that is here, each in an environment of its own.
 test-pythons: test
@@ -60,7 +62,7 @@ $(if $(2),$(MAKE) test VENV=.venv-$(1) PYTHON=$(2),@echo "make: no Python $(1) h
 endef
 
 test-slow: $(STAMP)
-	$(ONE_THREAD) $(BIN)/python -m pytest -q -n $(WORKERS) --timeout 1800 -m "slow and not gpu and not hardware"
+	$(ONE_THREAD) $(BIN)/python $(PYTEST) --timeout 1800 -m "slow and not gpu and not hardware"
 
 fuzz: $(STAMP)
 	$(ONE_THREAD) $(BIN)/python tests/fuzz_command_lines.py 20000
@@ -70,7 +72,7 @@ test-lowest:
 	$(PYTHON) -m venv --clear .venv-lowest
 	.venv-lowest/bin/python -m pip install --quiet --disable-pip-version-check uv
 	.venv-lowest/bin/uv pip install --quiet --python .venv-lowest/bin/python --resolution lowest-direct -e ".[dev,peers,ompl]"
-	$(ONE_THREAD) .venv-lowest/bin/python -m pytest -q -n $(WORKERS)
+	$(ONE_THREAD) .venv-lowest/bin/python $(PYTEST)
 
 check: $(STAMP)
 	$(BIN)/ruff check .

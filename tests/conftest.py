@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 from hypothesis import settings
 
 from marl_handover.cell import Cell, build_cell, cell_config, load_cell
@@ -116,9 +118,14 @@ def assert_same_angle():
 
 @pytest.fixture(scope="session")
 def twin_calibration(tmp_path_factory):
-    """A folder of what ``calibrate`` finds on the twin, with fewer postures than usual."""
+    """A folder of what ``calibrate`` finds on the twin, with fewer postures than usual; made once for all workers, and only read."""
     from marl_handover.cli import main
 
-    folder = tmp_path_factory.mktemp("calibration")
-    assert main(["calibrate", "hardware=twin", f"calibration={folder}", "postures=24", f"hardware.stop_file={folder / 'stop'}"]) == 0
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "twin_calibration"
+    with FileLock(f"{folder}.lock"):
+        if not (made := Path(f"{folder}.made")).exists():
+            arguments = [f"calibration={folder}", "postures=24", f"hardware.stop_file={folder / 'stop'}"]
+            assert main(["calibrate", "hardware=twin", *arguments]) == 0
+            made.touch()
     return folder
