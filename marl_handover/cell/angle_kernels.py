@@ -35,7 +35,7 @@ GAP = 1e-3
 OUTSIDE = 2.0
 """The beta of a place that lies between two pieces of a fibre, or on none."""
 
-_LEAST_RAD, _LEAST_BESIDE_RAD = 1e-12, 1e-7
+_LEAST_RAD, _LEAST_BESIDE_RAD = 1e-12, 3e-8
 """How near to 0 and pi eta is told from them: without lateral offsets, and with, which cost digits there."""
 
 _STRAIGHT_RAD = 1e-2
@@ -517,7 +517,7 @@ def middles(pairs: Floats, discs: Floats, n_discs: Ints, arcs: Floats, n_arcs: I
                     nearest, taken = away, arc
             arc_there = arcs[i, taken]
             there = arc_there[0] + min(arc_there[1], max(-arc_there[1], wrapped(eta[row] - arc_there[0])))
-            x, y = middle_place(pairs[i], discs[i, : n_discs[i]], arc_there, wrapped(there), pieces, scratch)
+            x, y = middle_place(pairs[i], discs[i, : n_discs[i]], arc_there, there, pieces, scratch)
             out[row, 0], out[row, 1] = in_world(pairs[i], x, y)
 
 

@@ -225,7 +225,7 @@ def pair_row(first: Arm, second: Arm, frame: SE2) -> Floats:
     row[0] = math.dist(first.base.position_mm, second.base.position_mm)
     for number, (arm, other, handed) in enumerate(((first, second, 1), (second, first, -1))):
         row[1 + 2 * number : 3 + 2 * number] = [math.sqrt(max(r * r - arm.lateral_mm**2, 0.0)) for r in (arm.r_min_mm, arm.r_max_mm)]
-        row[5 + number] = arm.lateral_mm
+        row[5 + number] = arm.lateral_mm if abs(arm.lateral_mm) > 1e-6 else 0.0
         ahead = arm.base.to_local(other.base.position_mm)
         low, high = sorted(handed * (yaw - math.atan2(ahead[1], ahead[0])) for yaw in arm.yaw_rad)
         whole = high - low > 2 * math.pi - 1e-6
