@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from marl_handover.cell.angle_kernels import Floats, fibre, is_shared, seen, wrapped
+from marl_handover.cell.angle_kernels import Floats, fibre, is_shared, length, seen, split, wrapped
+from marl_handover.cell.arm import REACH_TOLERANCE_MM
 from marl_handover.compiled import compiled
 
 TANGENT_SAMPLES = 180
@@ -146,8 +147,20 @@ def angle_arcs(pair: Floats, discs: Floats) -> Floats:
     if found > 1 and arcs[found - 1, 1] >= arcs[0, 0] + 2 * math.pi - _SAME_RAD:
         arcs[0, 0] = arcs[found - 1, 0] - 2 * math.pi
         found -= 1
+    kept = 0
     for number in range(found):
         begin, end = arcs[number, 0], arcs[number, 1]
-        arcs[number, 1] = min((end - begin) / 2, math.pi)
-        arcs[number, 0] = wrapped((begin + end) / 2)
-    return arcs[np.argsort(arcs[:found, 0])]
+        if _is_wide(pair, discs, begin, end, out, edges):
+            arcs[kept, 0], arcs[kept, 1] = wrapped((begin + end) / 2), min((end - begin) / 2, math.pi)
+            kept += 1
+    return arcs[np.argsort(arcs[:kept, 0])]
+
+
+@compiled
+def _is_wide(pair: Floats, discs: Floats, begin: float, end: float, out: Floats, edges: Floats) -> bool:
+    """Whether any fibre between two eta is longer than the tolerance of reach; what is narrower everywhere is no place."""
+    for step in range(1, 20):
+        eta = wrapped(begin + (end - begin) * step / 20)
+        if length(out, fibre(pair, discs, eta, out, edges)) * pair[0] > REACH_TOLERANCE_MM * split(pair, eta)[3]:
+            return True
+    return False

@@ -51,7 +51,7 @@ def wrapped(angle: float) -> float:
 
 
 @compiled
-def _split(pair: Floats, eta: float) -> tuple[float, float, float, float]:
+def split(pair: Floats, eta: float) -> tuple[float, float, float, float]:
     """The sign of eta, and its absolute value e, pi - e and sin(e), none of which is 0."""
     least = _LEAST_BESIDE_RAD if pair[5] != 0.0 or pair[6] != 0.0 else _LEAST_RAD
     sign = 1.0 if eta >= 0.0 else -1.0
@@ -248,7 +248,7 @@ def fibre(pair: Floats, discs: Floats, eta: float, out: Floats, edges: Floats) -
 
     On side 1, which is run through with a falling, begin is above end. ``edges`` is scratch. Gives the number of pieces.
     """
-    sign, e, rest, sin_e = _split(pair, eta)
+    sign, e, rest, sin_e = split(pair, eta)
     adds = _beside(pair, sign, e)
     count = 0
     for side in range(2):
@@ -287,7 +287,8 @@ def fibre(pair: Floats, discs: Floats, eta: float, out: Floats, edges: Floats) -
 
 
 @compiled
-def _length(pieces: Floats, count: int) -> float:
+def length(pieces: Floats, count: int) -> float:
+    """How long all pieces of a fibre are together, in rad."""
     total = 0.0
     for number in range(count):
         total += abs(pieces[number, 2] - pieces[number, 1])
@@ -327,8 +328,8 @@ def place(
         start += 2 * arcs[arc, 1] / unit + GAP
     there = min(arcs[taken, 1], max(-arcs[taken, 1], there)) * inset
     eta, pieces = _found_fibre(pair, discs, arcs[taken, 0] + there, arcs[taken], out, edges)
-    sign, e, _, sin_e = _split(pair, eta)
-    left = _length(out, pieces) * (1.0 - beta) / 2
+    sign, e, _, sin_e = split(pair, eta)
+    left = length(out, pieces) * (1.0 - beta) / 2
     for number in range(pieces):
         begin, end = out[number, 1], out[number, 2]
         if left <= abs(end - begin) or number == pieces - 1:
@@ -343,7 +344,7 @@ def place(
 def middle_place(pair: Floats, discs: Floats, arc: Floats, eta: float, out: Floats, edges: Floats) -> tuple[float, float]:
     """The middle (x, y) of the longest piece of a fibre, in the pair's frame; ``eta`` is of the arc ``arc``."""
     eta, pieces = _found_fibre(pair, discs, eta, arc, out, edges)
-    sign, e, _, sin_e = _split(pair, eta)
+    sign, e, _, sin_e = split(pair, eta)
     longest = -1.0
     x, y = math.nan, math.nan
     number = 0
@@ -392,7 +393,7 @@ def coordinates(
             nearest, taken = abs(offset) - arcs[arc, 1], arc
             alpha = start + (arcs[arc, 1] + offset / inset) / unit
         start += 2 * arcs[arc, 1] / unit + GAP
-    sign, e, _, sin_e = _split(pair, eta)
+    sign, e, _, sin_e = split(pair, eta)
     adds = _beside(pair, sign, e)
     near_1, near_2 = sign * a_1, sign * a_2
     if abs(near_1) < abs(near_2):  # the sum of both is e; of the other angle a turn may be missing
@@ -414,7 +415,7 @@ def coordinates(
 @compiled
 def _along(pieces: Floats, count: int, inset: float, side: int, a: float, e: float, edge: float) -> float:
     """Beta of the coordinate ``a`` of a side; NaN if it lies more than ``edge`` rad beside all pieces, else on the nearest."""
-    total = _length(pieces, count)
+    total = length(pieces, count)
     nearest, reached, at = edge, 0.0, math.nan
     own = a if side == 0 else e - a
     for number in range(count):
