@@ -183,6 +183,14 @@ class CorruptFile(HandoverError):
         self.what, self.path, self.reason = what, Path(path), reason
 
 
+class BadLine(HandoverError):
+    """A line of a file says what cannot be; ``error`` says why."""
+
+    def __init__(self, what: str, path: Path | str, number: int, error: HandoverError) -> None:
+        super().__init__(f"line {number} of {what} {shortened(str(path), LONGEST_REASON // 3)}: {error}")
+        self.what, self.path, self.number, self.error = what, Path(path), number, error
+
+
 class CannotWrite(HandoverError, OSError):
     """A file cannot be written. ``exit_status`` is 1 if its path is fine but there is no room, 2 if nothing can be written there."""
 

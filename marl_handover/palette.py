@@ -7,7 +7,7 @@ INK, GREY, FAINT, PAPER = "#222222", "#777777", "#CCCCCC", "#FFFFFF"
 ALERT = "#CC3311"
 """What cannot be, and what stops."""
 
-ARMS = (BLUE, RED)
+ARMS = (BLUE, RED, "#228833", "#EE7733", "#AA3377", "#33BBEE", "#7A5C3E", "#888800")
 """Colour of each arm, by its index."""
 
 SHARED = YELLOW

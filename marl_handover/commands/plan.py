@@ -113,12 +113,14 @@ def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> N
 
     planner.warm_up()
     done = [transfer for transfer in plan["transfers"] if not transfer["refused"]]
-    orders = [(ARM_LETTERS.index(t["arm"]), np.array(t["from"][:2]), np.array(t["to"][:2])) for t in done]
+    labels = planner.model.cell.labels
+    orders = [(labels.index(t["arm"]), np.array(t["from"][:2]), np.array(t["to"][:2])) for t in done]
     motions = plan_motions(planner, orders)
+    nearest = "the other arm" if len(labels) == 2 else "other arms"
     for number, motion in enumerate(motions, start=1):
         print(
-            f"motion {number}: arm {ARM_LETTERS[motion.arm]}, {motion.duration_s:.2f} s, grip path {motion.path_length_mm:.1f} mm, "
-            f"clearance to the other arm {motion.min_clearance_mm:.1f} mm, planned in {motion.planning_ms:.1f} ms"
+            f"motion {number}: arm {labels[motion.arm]}, {motion.duration_s:.2f} s, grip path {motion.path_length_mm:.1f} mm, "
+            f"clearance to {nearest} {motion.min_clearance_mm:.1f} mm, planned in {motion.planning_ms:.1f} ms"
         )
     schedule = coordinate(planner, motions)
     if len(motions) > 1:
@@ -128,7 +130,7 @@ def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> N
         )
     if config.motion:
         settings = {"cell_settings": asdict(planner.model.cell.config), "motion_settings": asdict(planner.motion)}
-        write_json(Path(config.motion), {**settings, "transfers": [motion_row(motion) for motion in motions]})
+        write_json(Path(config.motion), {**settings, "transfers": [motion_row(motion, labels) for motion in motions]})
     if config.motion_picture:
         from marl_handover.report.motion import motion_figure
 
@@ -148,7 +150,7 @@ def _planner(config: PlanConfig, policy: SupervisorPolicy) -> MotionPlanner | No
         for key, value in changed("arm_motion", config.arm_motion):
             raise InvalidSetting(key, value, "left out without motion=FILE or motion_picture=FILE")
         return None
-    # The planner is imported here: without motions, this command needs no compiled functions.
+    # The planner is imported here: without motions, this command compiles none of its functions.
     from marl_handover.cell import build_cell
     from marl_handover.motion.planner import MotionPlanner
 
@@ -182,9 +184,10 @@ def solve(policy: SupervisorPolicy, start: Floats, goal: Floats) -> dict[str, An
             transfers.append(_commanded(rules, pose, goal, result))
         if external >= 0:
             path_mm = float(rules.motion_cost(rules.cell, np.int64(external), result.placed[:2], result.pose[:2]))
-            transfers.append(_transfer(rules, external, True, result.placed, result.pose, path_mm, None))
+            transfers.append(_transfer(rules, external, None, result.placed, result.pose, path_mm, None))
         pose, previous = result.pose, result.previous_arm
-    optimum = int(ExactPlanner(rules).plan(start, goal).transfers)
+    planner = ExactPlanner(rules)
+    optimum = int(planner.plan(start, goal).transfers)
     return {
         "policy": policy.name,
         "architecture": rules.config.architecture,
@@ -194,6 +197,7 @@ def solve(policy: SupervisorPolicy, start: Floats, goal: Floats) -> dict[str, An
         "epsilon_deg": rules.config.epsilon_deg,
         "symmetry_order": rules.config.symmetry_order,
         "optimal_transfers": optimum or None,
+        **({} if optimum else {"unsolvable_because": planner.unsolvable_because(start, goal)}),
         "outcome": outcome.name.lower(),
         "transfers": transfers,
         "waiting": waiting,
@@ -216,20 +220,27 @@ def _commanded(rules: Rules, pose: Floats, goal: Floats, result: Transition) -> 
     if not feasible:
         reached = bool(Rules.transfer(rules, pose, goal, command)[1])
         refusal = MOTION if reached else OUT_OF_REACH
-    return _transfer(rules, int(command.arm), bool(command.final), pose, result.placed, path_mm, refusal)
+    receiver = None if command.final else int(command.receiver)
+    return _transfer(rules, int(command.arm), receiver, pose, result.placed, path_mm, refusal)
 
 
-def _transfer(rules: Rules, arm: int, final: bool, before: Floats, after: Floats, path_mm: float, refusal: str | None) -> dict[str, Any]:
-    """One entry of ``transfers``. A final transfer goes to the goal, not to a place of the chart, so it has no alpha and beta."""
-    alpha, beta = rules.cell.shared.from_table(after[:2])
-    inside = refusal is None and not final
+def _transfer(
+    rules: Rules, arm: int, receiver: int | None, before: Floats, after: Floats, path_mm: float, refusal: str | None
+) -> dict[str, Any]:
+    """One entry of ``transfers``. A final transfer goes to the goal, not to a place of the chart: no receiver, no alpha and beta."""
+    labels, alpha, beta = rules.cell.labels, None, None
+    if receiver is not None and refusal is None:
+        space = rules.cell.graph.edges[min(arm, receiver), max(arm, receiver)]
+        alpha, beta = (float(value) for value in space.from_table(after[:2]))
+    named = {} if labels == ARM_LETTERS else {"receiver": None if receiver is None else labels[receiver]}
     return {
-        "arm": ARM_LETTERS[arm],
-        "final": final,
+        "arm": labels[arm],
+        **named,
+        "final": receiver is None,
         "from": before.tolist(),
         "to": after.tolist(),
-        "alpha": float(alpha) if inside else None,
-        "beta": float(beta) if inside else None,
+        "alpha": alpha,
+        "beta": beta,
         "path_mm": path_mm,
         "refused": refusal is not None,
         "refusal": refusal,
@@ -254,20 +265,23 @@ def _policy(config: PlanConfig) -> SupervisorPolicy:
 
 def _text(plan: dict[str, Any], rules: Rules) -> str:
     """The sequence as a table, in mm and deg."""
-    goal_theta = plan["goal"][2]
+    goal_theta, width = plan["goal"][2], max(3, *map(len, rules.cell.labels))
     lines = [
         f"policy {plan['policy']}, architecture {plan['architecture']}, cell {plan['cell']}, epsilon {plan['epsilon_deg']:g} deg",
-        f"{'step':>4}  arm  final  {'x [mm]':>8} {'y [mm]':>8} {'theta [deg]':>12} {'to goal [deg]':>14} {'path [mm]':>10}  alpha, beta",
+        f"{'step':>4}  {'arm':<{width}}  final  {'x [mm]':>8} {'y [mm]':>8} {'theta [deg]':>12} {'to goal [deg]':>14} {'path [mm]':>10}"
+        "  alpha, beta",
     ]
 
     def row(step: str, arm: str, final: str, pose: list[float], path: str = "", note: str = "") -> str:
         left = math.degrees(rules.orientation_error(pose[2], goal_theta))
         x, y, theta = pose[0], pose[1], math.degrees(pose[2])
-        return f"{step:>4}  {arm:<3}  {final:<5}  {x:z8.1f} {y:z8.1f} {theta:z12.2f} {left:z14.2f} {path:>10}  {note}".rstrip()
+        return f"{step:>4}  {arm:<{width}}  {final:<5}  {x:z8.1f} {y:z8.1f} {theta:z12.2f} {left:z14.2f} {path:>10}  {note}".rstrip()
 
     lines.append(row("0", "", "", plan["start"], note="start"))
     for number, transfer in enumerate(plan["transfers"], start=1):
         place = "" if transfer["alpha"] is None else f"{transfer['alpha']:+z.3f}, {transfer['beta']:+z.3f}"
+        if transfer.get("receiver") is not None:
+            place = f"{place} towards {transfer['receiver']}".strip()
         note = f"refused: {REASONS[transfer['refusal']]}" if transfer["refused"] else place
         path = f"{transfer['path_mm']:.1f}"
         lines.append(row(str(number), transfer["arm"], "yes" if transfer["final"] else "no", transfer["to"], path, note))
@@ -277,4 +291,6 @@ def _text(plan: dict[str, Any], rules: Rules) -> str:
         f"{plan['outcome']}: {counted(len(plan['transfers']), 'transfer')} (optimum {optimum}), path {plan['total_path_mm']:.1f} mm, "
         f"orientation error {abs(plan['orientation_error_deg']):.2f} deg"
     )
+    if plan["optimal_transfers"] is None:
+        lines.append(f"unsolvable: {plan['unsolvable_because']}")
     return "\n".join(lines)

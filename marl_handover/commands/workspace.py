@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,7 @@ def workspace_summary(model: CellModel) -> dict[str, Any]:
         **_shared(cell),
         "bases": {label: [base.x_mm, base.y_mm] for label, base in zip(cell.labels, cell.bases, strict=True)},
         "arms": arms,
-        "obstacles": [],
+        "obstacles": [asdict(obstacle) for obstacle in cell.config.obstacles],
         "grid_mm": cell.config.grid_mm,
         "grid_points": {**points, "both": int((masks.sum(0) > 1).sum())},
     }

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from marl_handover import policies
 from marl_handover.arrays import Floats, one_where, wrap
+from marl_handover.cell import Cell
 from marl_handover.config import (
     BACKENDS,
     CellConfig,
@@ -32,12 +33,22 @@ from marl_handover.config import (
 from marl_handover.envs.centralised import CentralisedRules, MotionCommand
 from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.settings import HardwareConfig
-from marl_handover.learning.evaluation import Evaluation, Trace, decision_time, evaluate, random_problems, read_problems
+from marl_handover.learning.evaluation import (
+    TIMED_DECISIONS,
+    Evaluation,
+    Trace,
+    decision_times_us,
+    evaluate,
+    joined,
+    random_problems,
+    trace_text,
+)
 from marl_handover.motion.path_length_table import known_table
-from marl_handover.policies import SupervisorPolicy
+from marl_handover.policies import ShieldedPolicy, SupervisorPolicy
 from marl_handover.progress import Bar
-from marl_handover.task.episode import Decision, Episodes
+from marl_handover.task.episode import Decision, Episodes, Observer
 from marl_handover.task.planner import ExactPlanner
+from marl_handover.task.problem_file import PosedProblems, read_problems
 from marl_handover.task.rules import Outcome, Rules
 
 if TYPE_CHECKING:
@@ -118,25 +129,53 @@ Played = tuple[Evaluation, Callable[[], str], Rules, dict[str, Any]]
 def _play_kinematic(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool, progress: bool) -> Played:
     """All problems at once, on the batched rules."""
     rules = policy.rules
-    problems, noise = _problems(config, rules), rules.config.noise
-    trace, paths = Trace(rules), PathLengths(rules)
-
-    def observer(decision: Decision) -> None:
-        paths(decision)
-        if traced:
-            trace(decision)
-
-    with _bar(problems, progress) as bar:
-        result = evaluate(rules, policy.act, problems, config.seed, observer, bar.update, policy.under(rules).act)
+    posed, noise = _posed(config, rules, "" if policy.any_cell else f"policy={policy.name}"), rules.config.noise
+    supervisors = [policy.under(_rules_in(each.cell, rules)) if each.own else policy for each in posed]
+    traces = [Trace(supervisor.rules, each.numbers) for supervisor, each in zip(supervisors, posed, strict=True)]
+    paths, timings = PathLengths(rules), math.ceil(TIMED_DECISIONS / len(posed))
+    parts = []
+    with _bar(posed, progress) as bar:
+        for each, supervisor, trace in zip(posed, supervisors, traces, strict=True):
+            observers: list[Observer] = [*([] if each.own else [paths]), *([trace] if traced else [])]
+            # What is timed is a copy, which counts its repairs by itself.
+            timed = supervisor if each.own and not isinstance(supervisor, ShieldedPolicy) else supervisor.under(supervisor.rules)
+            seed = _seed_of(config.seed, each)
+            parts.append(
+                evaluate(
+                    supervisor.rules, supervisor.act, (each.start, each.goal), seed, _all_of(observers), bar.update, timed.act, timings
+                )
+            )
+    result = joined(parts, [each.numbers for each in posed])
     shown = {"noise": noise.report()} if rules.noisy or noise.observed else {}
-    return result, trace.text, rules, {**shown, **paths.report(), **_repaired(policy)}
+    return result, lambda: trace_text(traces), rules, {**shown, **paths.report(), **_repaired(supervisors)}
+
+
+def _rules_in(cell: Cell, rules: Rules) -> Rules:
+    """The rule book of a cell that a problem brings."""
+    if rules.config.reward.motion_weight:
+        limit = "0 for problems with arms or obstacles of their own: no lengths of paths are known there"
+        raise InvalidSetting("task.reward.motion_weight", rules.config.reward.motion_weight, limit)
+    return Rules(cell, rules.config)
+
+
+def _seed_of(seed: int, posed: PosedProblems) -> int:
+    """Of noise: cells that problems bring draw others than the command's."""
+    return int(np.random.SeedSequence([seed, int(posed.numbers[0])]).generate_state(1)[0]) if posed.own else seed
+
+
+def _all_of(observers: Sequence[Observer]) -> Observer | None:
+    def each(decision: Decision) -> None:
+        for observer in observers:
+            observer(decision)
+
+    return each if observers else None
 
 
 def _play_loop(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool, progress: bool) -> Played:
     """One problem after the other, in closed loop."""
     # Planner and simulator are imported where they are needed: the kinematic evaluation starts without them.
     from marl_handover.control.closed_loop import make_loop
-    from marl_handover.control.transfers import trace_text
+    from marl_handover.control.transfers import trace_text as loop_trace_text
     from marl_handover.envs.backends import NoisyBackend
 
     started = time.perf_counter()
@@ -145,18 +184,19 @@ def _play_loop(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool,
         rules, backend = loop.rules, loop.backend
         for note in getattr(backend, "notes", ()):
             print(note, file=sys.stderr)
-        problems = _problems(config, rules)
-        with _bar(problems, progress) as bar:
+        posed = _posed(config, rules, f"backend={config.backend}")
+        problems = posed[0].start, posed[0].goal
+        with _bar(posed, progress) as bar:
             played = play_problems(loop, problems, config.seed, bar.update)
     outcomes, steps = (np.array(values) for values in zip(*((int(true_outcome(e, rules)), len(e.first)) for e in played), strict=True))
     episodes = Episodes(outcomes, steps, np.stack([episode.first[-1].result.pose for episode in played]))
     optimal = ExactPlanner(rules).plan(*problems).transfers
-    result = Evaluation(episodes, optimal, decision_time(loop.policy.under(rules).act, problems), time.perf_counter() - started)
+    result = Evaluation(episodes, optimal, decision_times_us(loop.policy.under(rules).act, problems), time.perf_counter() - started)
     own = (
         {"noise": backend.noise.report(), "missed_grasps": backend.missed_grasps} if isinstance(backend, NoisyBackend) else _shown(options)
     )
     settings = {"chart_inset": rules.cell.config.chart_inset, "position_tolerance_mm": rules.config.position_tolerance_mm, **own}
-    return result, lambda: trace_text(played, rules), rules, {**loop_report(played, rules), **settings, **_repaired(loop.policy)}
+    return result, lambda: loop_trace_text(played, rules), rules, {**loop_report(played, rules), **settings, **_repaired([loop.policy])}
 
 
 def _shown(options: dict[str, Any]) -> dict[str, Any]:
@@ -164,17 +204,21 @@ def _shown(options: dict[str, Any]) -> dict[str, Any]:
     return {name: asdict(value) if isinstance(value, HardwareConfig) else value for name, value in options.items()}
 
 
-def _repaired(policy: SupervisorPolicy) -> dict[str, Any]:
+def _repaired(supervisors: Sequence[SupervisorPolicy]) -> dict[str, Any]:
     """Of a shielded policy: how many of its decisions the shield repaired."""
-    return {"repaired_decisions": policy.repaired} if isinstance(policy, policies.ShieldedPolicy) else {}
+    shields = [each for each in supervisors if isinstance(each, ShieldedPolicy)]
+    return {"repaired_decisions": sum(shield.repaired for shield in shields)} if shields else {}
 
 
-def _problems(config: AssessmentConfig, rules: Rules) -> tuple[Floats, Floats]:
-    return read_problems(rules, Path(config.problems)) if config.problems else random_problems(rules, config.episodes, config.seed)
+def _posed(config: AssessmentConfig, rules: Rules, fixed_for: str) -> list[PosedProblems]:
+    """Problems of a file, or random ones of the cell of ``rules``; ``fixed_for`` is what takes no other cell."""
+    if config.problems:
+        return read_problems(rules.cell, Path(config.problems), fixed_for)
+    return [PosedProblems(rules.cell, False, np.arange(config.episodes), *random_problems(rules, config.episodes, config.seed))]
 
 
-def _bar(problems: tuple[Floats, Floats], progress: bool) -> Bar:
-    return Bar(total=len(problems[0]), unit="episode", shown=progress, leave=False)
+def _bar(posed: Sequence[PosedProblems], progress: bool) -> Bar:
+    return Bar(total=sum(len(each.numbers) for each in posed), unit="episode", shown=progress, leave=False)
 
 
 def backend_options(config: AssessmentConfig) -> dict[str, Any]:

@@ -5,24 +5,21 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from marl_handover.arrays import Floats, wrap
+from marl_handover.arrays import Floats, one_where
+from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
-from marl_handover.errors import CorruptFile, NotFinite
-from marl_handover.files import read_bounded
-from marl_handover.parsing import LINES_BYTES, parse_object
 from marl_handover.task.episode import Act, Decision, Episodes, Noise, Observer, conclude, play
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
-from marl_handover.task.rules import Outcome, Rules, carried
+from marl_handover.task.rules import Command, Outcome, Rules, carried
 
 EVALUATION_SEED = 1_000_000_000
 """Problems of reports come from seeds from here on; training and its validation use others, so these are never seen."""
@@ -38,36 +35,6 @@ def random_problems(rules: Rules, count: int, seed: int) -> tuple[Floats, Floats
     return start.numpy(), goal.numpy()
 
 
-def read_problems(rules: Rules, path: Path) -> tuple[Floats, Floats]:
-    """Problems of a JSON Lines file of ``{"state": [x_mm, y_mm, theta_rad], "goal": [...]}``, all lines, in order.
-
-    Raises:
-        MissingFile, CorruptFile, NotFinite, OutOfReach: with the line's number.
-    """
-    poses: dict[str, list[Floats]] = {"state": [], "goal": []}
-    try:
-        text = read_bounded(path, LINES_BYTES, "problems file").decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise CorruptFile("problems file", path, str(error)) from error
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not line.strip():
-            continue
-        try:
-            row = parse_object(line, finite=False)
-            values = {key: np.array(row[key], float).reshape(3) for key in poses}
-        except (ValueError, KeyError, TypeError, OverflowError) as error:
-            raise CorruptFile("problems file", path, f"line {number} is not {{'state': [3 numbers], 'goal': [3 numbers]}}") from error
-        for key, value in values.items():
-            what = f"{key} in line {number} of {path}"
-            if not np.isfinite(value).all():
-                raise NotFinite(what, value.tolist())
-            rules.cell.require_reached(what, value)
-            poses[key].append(np.concatenate([value[:2], np.atleast_1d(wrap(value[2]))]))
-    if not poses["state"]:
-        raise CorruptFile("problems file", path, "it holds no problem")
-    return np.stack(poses["state"]), np.stack(poses["goal"])
-
-
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
     """Wilson score interval of a proportion, 95 % by default."""
     if trials == 0:
@@ -81,11 +48,18 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
 
 @dataclass
 class Evaluation:
-    """A policy's result on a set of problems. ``optimal`` is 0 where no plan exists within the step limit."""
+    """A policy's result on a set of problems.
+
+    Attributes:
+        episodes: how each ended.
+        optimal: (n,) fewest transfers, 0 where no plan exists within the step limit.
+        decisions_us: (k,) how long single decisions took.
+        wall_s: all in all.
+    """
 
     episodes: Episodes
     optimal: NDArray[np.int64]
-    decision_us: tuple[float, float]
+    decisions_us: Floats
     wall_s: float
 
     def report(self) -> dict[str, Any]:
@@ -95,6 +69,7 @@ class Evaluation:
         count, successes = len(outcome), int(solved.sum())
         low, high = wilson_interval(successes, count)
         known = solved & (self.optimal > 0)
+        p50, p99 = np.percentile(self.decisions_us, [50, 99])
         return {
             "episodes": count,
             "success_rate": successes / count,
@@ -104,7 +79,7 @@ class Evaluation:
             "optimal_mean_steps": float(self.optimal[self.optimal > 0].mean()) if (self.optimal > 0).any() else None,
             "steps_ratio": float((steps[known] / self.optimal[known]).mean()) if known.any() else None,
             "outcomes": {kind.name.lower(): int((outcome == int(kind)).sum()) for kind in Outcome if kind is not Outcome.NONE},
-            "decision_us": {"p50": self.decision_us[0], "p99": self.decision_us[1]},
+            "decision_us": {"p50": float(p50), "p99": float(p99)},
             "wall_s": self.wall_s,
         }
 
@@ -117,6 +92,7 @@ def evaluate(
     observer: Observer | None = None,
     progress: Callable[[int], object] = lambda done: None,
     timed: Act | None = None,
+    timings: int = TIMED_DECISIONS,
 ) -> Evaluation:
     """Play all problems (n, 3), (n, 3) with a batched numpy policy, in chunks, and time single decisions.
 
@@ -128,6 +104,7 @@ def evaluate(
         observer: sees every decision, with episode numbers over all problems.
         progress: called with the number of problems a chunk finished.
         timed: what is timed instead of ``act``, for one that counts its decisions.
+        timings: how many decisions are timed at most.
     """
     started = time.perf_counter()
     noise, seeing = placement_noise(rules, seed), mistaken(rules, act, seed)
@@ -139,7 +116,15 @@ def evaluate(
         progress(len(start))
     episodes = Episodes(*(np.concatenate([part[index] for part in parts]) for index in range(3)))
     optimal = ExactPlanner(rules).plan(*problems).transfers
-    return Evaluation(episodes, optimal, decision_time(timed or act, problems), time.perf_counter() - started)
+    return Evaluation(episodes, optimal, decision_times_us(timed or act, problems, timings), time.perf_counter() - started)
+
+
+def joined(parts: Sequence[Evaluation], numbers: Sequence[NDArray[np.int64]]) -> Evaluation:
+    """One result of several, whose episodes have the ``numbers`` (n,) among all."""
+    order = np.argsort(np.concatenate(numbers))
+    episodes = Episodes(*(np.concatenate(columns)[order] for columns in zip(*(part.episodes for part in parts), strict=True)))
+    optimal = np.concatenate([part.optimal for part in parts])[order]
+    return Evaluation(episodes, optimal, np.concatenate([part.decisions_us for part in parts]), sum(part.wall_s for part in parts))
 
 
 def _shifted(observer: Observer, first: int) -> Observer:
@@ -172,18 +157,17 @@ def mistaken(rules: Rules, act: Act, seed: int) -> Act:
     return seeing
 
 
-def decision_time(act: Act, problems: tuple[Floats, Floats]) -> tuple[float, float]:
-    """Median and 99th percentile, in microseconds, of one decision for one problem: pose in, action out."""
+def decision_times_us(act: Act, problems: tuple[Floats, Floats], most: int = TIMED_DECISIONS) -> Floats:
+    """How long single decisions take, pose in, action out: (k,) in microseconds, ``most`` of them at most."""
     elapsed = []
     none = np.int64(-1)
-    for index in range(-20, min(TIMED_DECISIONS, max(len(problems[0]), 100))):
+    for index in range(-min(20, most), min(most, max(len(problems[0]), 100))):
         row = index % len(problems[0])
         begun = time.perf_counter_ns()
         act(problems[0][row], problems[1][row], none)
         if index >= 0:  # the first ones warm up
             elapsed.append(time.perf_counter_ns() - begun)
-    p50, p99 = np.percentile(elapsed, [50, 99]) / 1e3
-    return float(p50), float(p99)
+    return np.array(elapsed) / 1e3
 
 
 def judged_by(rules: Rules) -> dict[str, Any]:
@@ -196,27 +180,33 @@ def judged_by(rules: Rules) -> dict[str, Any]:
 
 
 class Trace:
-    """An observer of roll-outs. Architecture A's external last transfer becomes a line of its own, with ``"final": true``."""
+    """An observer of roll-outs. Architecture A's external last transfer becomes a line of its own, with ``"final": true``.
 
-    def __init__(self, rules: Rules) -> None:
-        self.rules = rules
+    Arms have their labels in the cell: of a mirrored pair L and R, else their names, and then lines say the receiver, too. A command to
+    arms that share no place has none: null, and so are alpha and beta.
+
+    Args:
+        rules: what the episodes are judged by.
+        numbers: (n,) which of all episodes these are; all, in order, if None.
+    """
+
+    def __init__(self, rules: Rules, numbers: NDArray[np.int64] | None = None) -> None:
+        self.rules, self.numbers = rules, numbers
         self.episodes: dict[int, list[dict[str, Any]]] = {}
+        self._labels = rules.cell.labels
+        self._says_receiver = self._labels != ARM_LETTERS
 
     def __call__(self, decision: Decision) -> None:
         """Take in one decision of the running episodes."""
-        alpha, beta = self.rules.cell.shared.from_table(decision.result.command.place_mm)
-        for row, episode in enumerate(decision.episode):
-            lines = self.episodes.setdefault(int(episode), [])
-            commanded, external = self._commanded(decision, row, float(alpha[row]), float(beta[row])), self._external(decision, row)
-            for line in (commanded, external):
+        points = chart_points(self.rules.cell, decision.result.command)
+        for row, index in enumerate(decision.episode):
+            episode = int(index if self.numbers is None else self.numbers[index])
+            lines = self.episodes.setdefault(episode, [])
+            for line in (self._commanded(decision, row, points[row]), self._external(decision, row)):
                 if line is not None:
-                    lines.append({"episode": int(episode), "step": len(lines), **line})
+                    lines.append({"episode": episode, "step": len(lines), **line})
 
-    def text(self) -> str:
-        """All lines, episode by episode."""
-        return "".join(json.dumps(line) + "\n" for _, lines in sorted(self.episodes.items()) for line in lines)
-
-    def _commanded(self, decision: Decision, row: int, alpha: float, beta: float) -> dict[str, Any] | None:
+    def _commanded(self, decision: Decision, row: int, point: Floats) -> dict[str, Any] | None:
         """The policy's own transfer; None where it was ignored because the episode was solved at its start."""
         result = decision.result
         external = int(result.external_arm[row]) >= 0
@@ -224,16 +214,18 @@ class Trace:
             return None
         final = bool(result.command.final[row])
         place = decision.goal[row, :2] if final else result.command.place_mm[row]
+        if final and np.isnan(point).any():
+            point = np.zeros(2)  # it goes to the goal, whatever was said besides
         terminated, made = bool(result.terminated[row]), decision.made[row] + result.transfers[row]
         truncated, ended = conclude(result.terminated[row], result.outcome[row], made, self.rules.config.max_steps)
         outcome = Outcome(int(ended))
         return {
             **self._problem(decision, row, decision.pose[row], int(decision.previous_arm[row])),
-            "arm": ARM_LETTERS[int(result.command.arm[row])],
+            **self._who(int(result.command.arm[row]), None if final else int(result.command.receiver[row])),
             "final": final,
-            "place": place.tolist(),
-            "alpha": alpha,
-            "beta": beta,
+            "place": _listed(place),
+            "alpha": _listed(point[0]),
+            "beta": _listed(point[1]),
             "next_state": result.placed[row].tolist(),
             "reward": float(result.reward[row]),
             "terminated": terminated and not external,
@@ -254,7 +246,7 @@ class Trace:
         previous = int(result.command.arm[row]) if commanded and bool(result.feasible[row]) else int(decision.previous_arm[row])
         return {
             **self._problem(decision, row, result.placed[row], previous),
-            "arm": ARM_LETTERS[arm],
+            **self._who(arm, None),
             "final": True,
             "place": decision.goal[row, :2].tolist(),
             "alpha": 0.0,
@@ -267,10 +259,36 @@ class Trace:
             **judged_by(self.rules),
         }
 
-    @staticmethod
-    def _problem(decision: Decision, row: int, pose: Any, previous: int) -> dict[str, Any]:
+    def _who(self, arm: int, receiver: int | None) -> dict[str, Any]:
+        said: dict[str, Any] = {"arm": self._labels[arm]}
+        if self._says_receiver:
+            said["receiver"] = None if receiver is None else self._labels[receiver]
+        return said
+
+    def _problem(self, decision: Decision, row: int, pose: Any, previous: int) -> dict[str, Any]:
         return {
             "state": pose.tolist(),
             "goal": decision.goal[row].tolist(),
-            "previous_arm": ARM_LETTERS[previous] if previous >= 0 else None,
+            "previous_arm": self._labels[previous] if previous >= 0 else None,
         }
+
+
+def trace_text(traces: Iterable[Trace]) -> str:
+    """All lines, episode by episode."""
+    episodes = {number: lines for trace in traces for number, lines in trace.episodes.items()}
+    return "".join(json.dumps(line) + "\n" for _, lines in sorted(episodes.items()) for line in lines)
+
+
+def chart_points(cell: Cell, command: Command) -> Floats:
+    """Alpha and beta (n, 2) of the places that commands (n,) name; NaN where arm and receiver share none."""
+    place, points = command.place_mm, np.full(command.place_mm.shape, math.nan)
+    with np.errstate(invalid="ignore"):
+        for (i, j), space in cell.graph.edges.items():
+            asked = ((command.arm == i) & (command.receiver == j)) | ((command.arm == j) & (command.receiver == i))
+            points = one_where(asked, np.stack(space.from_table(place), -1), points)
+    return np.clip(points, -1.0, 1.0)  # rounding may put the edge of a chart beyond it
+
+
+def _listed(values: Any) -> Any:
+    """Numbers as JSON has them: null for what is none."""
+    return None if np.isnan(values).any() else values.tolist()

@@ -43,6 +43,7 @@ class SupervisorPolicy(ABC):
     """
 
     variant = "hierarchical"
+    any_cell = False  # whether it acts in any other cell, too, once it is under that one's rule book
 
     def __init__(self, rules: Rules, name: str) -> None:
         self.rules, self.name = rules, name
@@ -117,7 +118,7 @@ class ShieldedPolicy(SupervisorPolicy):
     def __init__(self, inner: SupervisorPolicy) -> None:
         super().__init__(inner.rules, SHIELDED + inner.name)
         self.inner, self.about = inner, inner.about
-        self.variant = inner.variant
+        self.variant, self.any_cell = inner.variant, inner.any_cell
         self.repaired = 0
 
     def under(self, rules: Rules) -> SupervisorPolicy:

@@ -46,9 +46,19 @@ def names() -> tuple[str, ...]:
     return (*POLICIES, *PRETRAINED)
 
 
+@lru_cache(maxsize=64)
+def _hops(num_arms: int, edges: tuple[tuple[int, int], ...]) -> NDArray[np.int64]:
+    """The fewest hand-overs from each arm to each other one: (num_arms, num_arms)."""
+    adjacency = np.zeros((num_arms, num_arms))
+    adjacency[tuple(zip(*edges, strict=True))] = 1.0
+    return shortest_path(adjacency, directed=False, unweighted=True).astype(np.int64)
+
+
 @POLICIES.register("exact")
 class ExactPolicy(SupervisorPolicy):
     """The exact planner in closed loop: the yardstick."""
+
+    any_cell = True
 
     def __init__(self, rules: Rules, seed: int = 0) -> None:
         super().__init__(rules, "exact")
@@ -69,21 +79,21 @@ class ExactPolicy(SupervisorPolicy):
 class RandomPolicy(SupervisorPolicy):
     """Uniform actions."""
 
+    any_cell = True
+
     def __init__(self, rules: Rules, seed: int = 0) -> None:
         super().__init__(rules, "random")
         self.generator = np.random.default_rng(seed)
 
     def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
-        """Anything."""
-        return self.generator.uniform(-1.0, 1.0, (*pose.shape[:-1], self.rules.action_size))
-
-
-@lru_cache(maxsize=64)
-def _hops(num_arms: int, edges: tuple[tuple[int, int], ...]) -> NDArray[np.int64]:
-    """The fewest hand-overs from each arm to each other one: (num_arms, num_arms)."""
-    adjacency = np.zeros((num_arms, num_arms))
-    adjacency[tuple(zip(*edges, strict=True))] = 1.0
-    return shortest_path(adjacency, directed=False, unweighted=True).astype(np.int64)
+        """Anything; in a cell of more than two arms, towards a receiver that shares a place with the arm."""
+        cell, count = self.rules.cell, self.rules.cell.num_arms
+        action = self.generator.uniform(-1.0, 1.0, (*pose.shape[:-1], self.rules.action_size))
+        if count != 2:
+            shares = _hops(count, tuple(cell.graph.edges))[action[..., 1 : 1 + count].argmax(-1)] == 1
+            receivers = action[..., 1 + count : 1 + 2 * count]
+            receivers[~shares] = -1.0
+        return action
 
 
 @POLICIES.register("greedy")
@@ -92,6 +102,7 @@ class GreedyPolicy(SupervisorPolicy):
     least error. Among many arms, the object goes to those that are fewer hand-overs away from one that reaches the goal.
     """
 
+    any_cell = True
     PLACES = 33
 
     def __init__(self, rules: Rules, seed: int = 0) -> None:

@@ -75,7 +75,7 @@ __all__ = [
     "series_style",
 ]
 
-ARM_LINES = ("-", "--")
+ARM_LINES = ("-", "--", "-.", ":")
 """Line style of each arm, by its index."""
 
 

@@ -24,6 +24,7 @@ from marl_handover.geometry.se3 import apply
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import LOADED_PHASES, PHASES, Phase, PickPlacePaths, TransferMotion
+from marl_handover.report.arm_labels import stored_labels
 from marl_handover.report.figure_style import BLUE, FAINT, GREY, INK, PAPER, RED, YELLOW, arm_colour, ruled
 from marl_handover.report.table import Axes, draw_bases, draw_sectors, frame_table
 
@@ -43,10 +44,11 @@ def read_motions(content: Mapping[str, Any], path: Path) -> list[TransferMotion]
         CorruptFile: for anything else.
     """
     try:
-        motions = [_motion(row) for row in content["transfers"]]
+        labels = stored_labels(content)
+        motions = [_motion(row, labels) for row in content["transfers"]]
     except KeyError as error:
         raise CorruptFile("motion", path, f"it lacks {error.args[0]!r}") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, AttributeError) as error:
         raise CorruptFile("motion", path, str(error)) from error
     if not motions:
         raise CorruptFile("motion", path, "it has no transfers")
@@ -61,18 +63,23 @@ def require_fit(motions: Sequence[TransferMotion], model: CellModel) -> None:
             raise InvalidSetting("cell", model.cell.config.name, "the cell of the motions; this one's arms would miss the block with them")
 
 
-def _motion(row: Mapping[str, Any]) -> TransferMotion:
+def _motion(row: Mapping[str, Any], labels: Sequence[str]) -> TransferMotion:
+    arm = labels.index(row["arm"])
     phases = tuple(_phase(part) for part in row["phases"])
     if not any(phase.name in LOADED_PHASES for phase in phases):
         raise ValueError("a transfer has no phase in which the block is carried")
     none = np.empty((0, 5))
+    if len(labels) == 2:
+        other = _numbers(row["parked_other_rad"], 5)
+    else:
+        other = _numbers([row["other_arms_rad"][label] for label in _others(labels, arm)], len(labels) - 1, 5)
     return TransferMotion(
-        arm=ARM_LETTERS.index(row["arm"]),
+        arm=arm,
         from_mm=_numbers(row["from"], 2),
         to_mm=_numbers(row["to"], 2),
         paths=PickPlacePaths(none, none, none),
         phases=phases,
-        other_joints_rad=_numbers(row["parked_other_rad"], 5),
+        other_joints_rad=other,
         path_length_mm=float(row["path_length_mm"]),
         min_clearance_mm=float(row["min_clearance_mm"]),
         planning_ms=float(row["planning_ms"]),
@@ -106,7 +113,7 @@ def motion_figure(motions: Sequence[TransferMotion], model: CellModel, settings:
     clearance = figure.add_subplot(grid[2, 1], sharex=joints)
     _draw_above(above, motions, model)
     _draw_side(side, motions, model)
-    _draw_joints(joints, motions)
+    _draw_joints(joints, motions, model.cell.labels)
     _draw_clearance(clearance, motions, model, settings)
     total = sum(motion.duration_s for motion in motions)
     path = sum(motion.path_length_mm for motion in motions)
@@ -183,14 +190,14 @@ def _starts(motions: Sequence[TransferMotion]) -> Floats:
     return np.concatenate([[0.0], np.cumsum([motion.duration_s for motion in motions])])
 
 
-def _draw_joints(axes: Axes, motions: Sequence[TransferMotion]) -> None:
+def _draw_joints(axes: Axes, motions: Sequence[TransferMotion], labels: Sequence[str]) -> None:
     starts = _starts(motions)
     for motion, begin_s in zip(motions, starts, strict=False):
         t_s = begin_s + np.concatenate([phase.t_s for phase in motion.phases]) - motion.phases[0].t_s[0]
         degrees = np.degrees(np.concatenate([phase.joints_rad for phase in motion.phases]))
         for joint, (colour, line) in enumerate(JOINT_STYLES):
             axes.plot(t_s, degrees[:, joint], color=colour, linestyle=line, linewidth=1.3)
-    _shade(axes, motions, starts)
+    _shade(axes, motions, starts, labels)
     handles = [
         Line2D([], [], color=colour, linestyle=line, label=name.replace("_", " "))
         for name, (colour, line) in zip(ARM_JOINTS, JOINT_STYLES, strict=True)
@@ -209,9 +216,9 @@ def _draw_clearance(axes: Axes, motions: Sequence[TransferMotion], model: CellMo
         axes.plot(t_s, np.minimum(to_table, SHOWN_MM), color=RED, linewidth=1.3, linestyle="--")
     for demanded, colour in ((settings.arm_clearance_mm, BLUE), (settings.ground_clearance_mm, RED)):
         axes.axhline(demanded, color=colour, linewidth=0.7, linestyle=":")
-    _shade(axes, motions, starts, labels=False)
+    _shade(axes, motions, starts)
     handles = [
-        Line2D([], [], color=BLUE, label="to the other arm, block included"),
+        Line2D([], [], color=BLUE, label=f"to {'the other arm' if model.cell.num_arms == 2 else 'other arms'}, block included"),
         Line2D([], [], color=RED, linestyle="--", label="arm to the table"),
         Line2D([], [], color=GREY, linestyle=":", label="demanded"),
     ]
@@ -222,8 +229,8 @@ def _draw_clearance(axes: Axes, motions: Sequence[TransferMotion], model: CellMo
     ruled(axes)
 
 
-def _shade(axes: Axes, motions: Sequence[TransferMotion], starts: Floats, labels: bool = True) -> None:
-    """A band where the block is carried, in the arm's colour, and a line between transfers."""
+def _shade(axes: Axes, motions: Sequence[TransferMotion], starts: Floats, labels: Sequence[str] = ()) -> None:
+    """A band where the block is carried, in the arm's colour, and a line between transfers, with the arms' ``labels``, if given."""
     for number, (motion, begin_s) in enumerate(zip(motions, starts, strict=False), start=1):
         carried = [phase for phase in motion.phases if phase.name in LOADED_PHASES]
         zero = motion.phases[0].t_s[0]
@@ -231,7 +238,7 @@ def _shade(axes: Axes, motions: Sequence[TransferMotion], starts: Floats, labels
         axes.axvline(begin_s + motion.duration_s, color=FAINT, linewidth=0.8)
         if labels:
             axes.annotate(
-                f"{number}: {ARM_LETTERS[motion.arm]}", (begin_s + motion.duration_s / 2, 1.0), xycoords=("data", "axes fraction"),
+                f"{number}: {labels[motion.arm]}", (begin_s + motion.duration_s / 2, 1.0), xycoords=("data", "axes fraction"),
                 xytext=(0, 2), textcoords="offset points", fontsize=8, ha="center", color=arm_colour(motion.arm),
             )  # fmt: skip
     axes.set_xlim(0.0, starts[-1])
@@ -257,23 +264,35 @@ def plan_motions(planner: MotionPlanner, transfers: Iterable[tuple[int, Floats, 
             others = planner.others_home_rad(arm)
             motions.append(planner.pick_place(arm, start, end, planner.homes_rad[arm], others[0] if len(others) == 1 else others))
         except WorkFailed as failure:
-            raise NoMotion(number, ARM_LETTERS[arm], str(failure)) from failure
+            raise NoMotion(number, planner.model.cell.labels[arm], str(failure)) from failure
     return motions
 
 
-def motion_row(motion: TransferMotion) -> dict[str, Any]:
-    """One entry of ``transfers`` in the motion file: mm, rad, s; ``min_clearance_mm`` is the moving arm's to the other one."""
+def motion_row(motion: TransferMotion, labels: Sequence[str] = ARM_LETTERS) -> dict[str, Any]:
+    """One entry of ``transfers`` in the motion file: mm, rad, s; ``min_clearance_mm`` is the moving arm's to the other ones.
+
+    Where the other arms hold still is ``parked_other_rad`` (5,) of a pair, else ``other_arms_rad``, (5,) of each by its label.
+    """
     phases = [{"name": p.name, "t_s": p.t_s.tolist(), "joints_rad": p.joints_rad.tolist()} for p in motion.phases]
+    still = motion.other_joints_rad.tolist()
     return {
-        "arm": ARM_LETTERS[motion.arm],
+        "arm": labels[motion.arm],
         "from": motion.from_mm.tolist(),
         "to": motion.to_mm.tolist(),
         "phases": phases,
-        "parked_other_rad": motion.other_joints_rad.tolist(),
+        **(
+            {"parked_other_rad": still}
+            if len(labels) == 2
+            else {"other_arms_rad": dict(zip(_others(labels, motion.arm), still, strict=True))}
+        ),
         "path_length_mm": motion.path_length_mm,
         "min_clearance_mm": motion.min_clearance_mm,
         "planning_ms": motion.planning_ms,
     }
+
+
+def _others(labels: Sequence[str], arm: int) -> list[str]:
+    return [label for index, label in enumerate(labels) if index != arm]
 
 
 def grip_mm(model: CellModel, arm: int, joints_rad: Floats) -> Floats:

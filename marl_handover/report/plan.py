@@ -13,10 +13,21 @@ from matplotlib.lines import Line2D
 
 from marl_handover.cell import CellModel
 from marl_handover.cell.cell import Cell
-from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.errors import CorruptFile, counted
+from marl_handover.report.arm_labels import arm_index, stored_labels
 from marl_handover.report.figure_style import FAINT, GOAL, GREY, INK, SHARED, arm_colour
-from marl_handover.report.table import Axes, bare, draw_bases, draw_block, draw_chart, draw_circles, draw_sectors, frame_table
+from marl_handover.report.table import (
+    Axes,
+    bare,
+    draw_bases,
+    draw_block,
+    draw_chart,
+    draw_circles,
+    draw_obstacles,
+    draw_sectors,
+    draw_shared,
+    frame_table,
+)
 
 
 def workspace_figure(model: CellModel) -> Figure:
@@ -31,10 +42,13 @@ def workspace_figure(model: CellModel) -> Figure:
         label = f"grid: {cell.labels[arm]} alone, {len(alone)}"
         axes.scatter(alone[:, 0], alone[:, 1], s=2.5, color=arm_colour(arm), linewidths=0, label=label, rasterized=True)
     both = points[reached > 1]
-    axes.scatter(both[:, 0], both[:, 1], s=4.5, color=SHARED, linewidths=0, label=f"grid: both, {len(both)}", rasterized=True)
+    who = "both" if cell.num_arms == 2 else "two or more"
+    axes.scatter(both[:, 0], both[:, 1], s=4.5, color=SHARED, linewidths=0, label=f"grid: {who}, {len(both)}", rasterized=True)
     draw_circles(axes, cell)
     draw_sectors(axes, cell, strength=0.06, labelled=True)
-    draw_chart(axes, cell)
+    if cell.num_arms == 2:
+        draw_chart(axes, cell)
+    draw_obstacles(axes, cell, labelled=True)
     draw_bases(axes, cell)
     frame_table(axes, cell)
     axes.set_xlabel("x [mm]")
@@ -66,15 +80,16 @@ def check_plan(plan: Mapping[str, Any], path: Path) -> None:
         poses = [plan["start"], plan["goal"], *(transfer[key] for transfer in plan["transfers"] for key in ("from", "to"))]
         if not (np.isfinite(np.array(poses, float)).all() and all(len(pose) == 3 for pose in poses)):
             raise ValueError("a pose is not three finite numbers")
+        labels = stored_labels(plan)
         for transfer in plan["transfers"]:
-            ARM_LETTERS.index(transfer["arm"])
+            labels.index(transfer["arm"])
             bool(transfer["final"])
         [plan[key] for key in ("policy", "outcome")]
         if not plan["transfers"]:
             raise ValueError("it has no transfers")
     except KeyError as error:
         raise CorruptFile("plan", path, f"it lacks {error.args[0]!r}") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, AttributeError) as error:
         raise CorruptFile("plan", path, str(error)) from error
 
 
@@ -91,7 +106,7 @@ def plan_figure(plan: Mapping[str, Any], cell: Cell) -> Figure:
     for index, (axes, transfer) in enumerate(zip(grid, transfers, strict=False)):
         _draw_transfer(axes, cell, transfer, plan["goal"])
         weight = "bold" if transfer["final"] else "normal"
-        axes.set_title(_caption(index, transfer), fontsize=9, fontweight=weight, color=arm_colour(ARM_LETTERS.index(transfer["arm"])))
+        axes.set_title(_caption(index, transfer), fontsize=9, fontweight=weight, color=arm_colour(arm_index(cell, transfer["arm"])))
     for axes in grid[len(transfers) :]:
         axes.set_axis_off()
     figure.suptitle(_headline(plan), fontsize=10)
@@ -110,9 +125,12 @@ def _panel_height(cell: Cell) -> float:
 
 def _draw_transfer(axes: Axes, cell: Cell, transfer: Mapping[str, Any], goal: Sequence[float]) -> None:
     side_mm = cell.config.block.side_mm
-    arm = ARM_LETTERS.index(transfer["arm"])
+    arm = arm_index(cell, transfer["arm"])
     base, colour = cell.bases[arm], arm_colour(arm)
     draw_sectors(axes, cell, strength=0.05, width=0.5)
+    if cell.num_arms != 2:
+        draw_shared(axes, cell)
+    draw_obstacles(axes, cell)
     rays = [(transfer["from"], ":")] if transfer.get("refused") else [(transfer["from"], ":"), (transfer["to"], "-")]
     for point, style in rays:
         axes.plot([base.x_mm, point[0]], [base.y_mm, point[1]], color=colour, linestyle=style, linewidth=1.6, zorder=4)

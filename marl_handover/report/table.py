@@ -11,7 +11,8 @@ from matplotlib.patches import Circle, Polygon
 
 from marl_handover.arrays import Floats
 from marl_handover.cell.cell import Cell
-from marl_handover.report.figure_style import FAINT, INK, PAPER, arm_colour, arm_line
+from marl_handover.report.arm_labels import marks
+from marl_handover.report.figure_style import FAINT, GREY, INK, PAPER, SHARED, arm_colour, arm_line
 
 Axes = Any
 """matplotlib's, which has no types of its own here."""
@@ -41,7 +42,7 @@ def draw_sectors(axes: Axes, cell: Cell, strength: float = 0.1, width: float = 1
     for arm in range(cell.num_arms):
         outline, colour = sector_mm(cell, arm), arm_colour(arm)
         axes.add_patch(Polygon(outline, closed=True, facecolor=colour, edgecolor="none", alpha=strength, zorder=1))
-        label = f"annulus sector of {cell.labels[arm]}" if labelled else None
+        label = f"annulus sector of {_marked(cell, arm)}" if labelled else None
         edge = Polygon(outline, closed=True, fill=False, edgecolor=colour, linewidth=width, linestyle=arm_line(arm), label=label, zorder=3)
         axes.add_patch(edge)
 
@@ -57,11 +58,36 @@ def draw_circles(axes: Axes, cell: Cell) -> None:
 
 
 def draw_bases(axes: Axes, cell: Cell, size: float = 13.0) -> None:
-    """A lettered square at each base; ``size`` in points."""
-    for arm, base in enumerate(cell.bases):
+    """A square at each base, with the arm's mark; ``size`` in points."""
+    for arm, (base, mark) in enumerate(zip(cell.bases, marks(cell), strict=True)):
         axes.plot(base.x_mm, base.y_mm, "s", color=arm_colour(arm), markersize=size, zorder=11)
         letter = {"color": PAPER, "ha": "center", "va": "center", "fontsize": 0.65 * size, "fontweight": "bold", "zorder": 12}
-        axes.text(base.x_mm, base.y_mm, cell.labels[arm][:1], **letter)
+        axes.text(base.x_mm, base.y_mm, mark, **letter)
+
+
+def _marked(cell: Cell, arm: int) -> str:
+    """An arm's label, with the mark at its base in front unless it begins with that."""
+    mark, label = marks(cell)[arm], cell.labels[arm]
+    return label if label.startswith(mark) else f"{mark}: {label}"
+
+
+def draw_shared(axes: Axes, cell: Cell, strength: float = 0.45, step_mm: float = 2.0) -> None:
+    """What any two arms share, shaded."""
+    frame_table(axes, cell)
+    x, y = (np.arange(low, high, step_mm) for low, high in (axes.get_xlim(), axes.get_ylim()))
+    shared = cell.reaches(np.stack(np.meshgrid(x, y), -1)).sum(-1) > 1
+    axes.contourf(x, y, shared, levels=[0.5, 1.5], colors=[SHARED], alpha=strength, zorder=2)
+
+
+def draw_obstacles(axes: Axes, cell: Cell, labelled: bool = False) -> None:
+    """Obstacles, and dashed how far the block's centre keeps away from them."""
+    for number, (obstacle, keep_out) in enumerate(zip(cell.config.obstacles, cell.keep_out, strict=True)):
+        label = "obstacle" if labelled and not number else None
+        body = Circle((obstacle.x_mm, obstacle.y_mm), obstacle.radius_mm, facecolor=GREY, edgecolor=INK, hatch="///", zorder=4, label=label)
+        axes.add_patch(body)
+        label = "kept clear by the block's centre" if label else None
+        edge = {"fill": False, "edgecolor": INK, "linestyle": "--", "linewidth": 0.9, "zorder": 4, "label": label}
+        axes.add_patch(Circle((keep_out.x_mm, keep_out.y_mm), keep_out.radius_mm, **edge))
 
 
 def draw_chart(axes: Axes, cell: Cell, inner: Sequence[float] = (-0.5, 0.0, 0.5), label: str | None = "chart (α, β)") -> None:

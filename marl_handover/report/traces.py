@@ -17,6 +17,7 @@ from marl_handover.config import LoopConfig
 from marl_handover.errors import CorruptFile, InvalidSetting
 from marl_handover.files import read_lines
 from marl_handover.parsing import LINES_BYTES, parse_object
+from marl_handover.report.arm_labels import arm_index
 from marl_handover.task.rules import ROUNDING_RAD, Command, Outcome, Rules
 
 Integers = NDArray[np.int64]
@@ -25,10 +26,11 @@ Integers = NDArray[np.int64]
 class Trace(NamedTuple):
     """Episodes of a trace (n), in order, each up to its first verdict. Poses (n, 3) in mm and rad.
 
-    ``before`` and ``end`` are the object's poses around the last transfer, which ``arm`` made, as a ``final`` one or not. ``outcome`` holds
-    values of :class:`Outcome`, as the trace judged. ``looped``: it is one of the closed loop, where poses are measured ones. ``place``
-    (n, 2): where the last transfer was to put the object, in mm. ``external``: it is of architecture A, in which a refusal ends nothing.
-    ``symmetry_order``: of the block, 0 where the file does not say, as those of older versions.
+    ``before`` and ``end`` are the object's poses around the last transfer, which ``arm``, by its label, made, as a ``final`` one or not.
+    ``outcome`` holds values of :class:`Outcome`, as the trace judged. ``looped``: it is one of the closed loop, where poses are measured
+    ones. ``place`` (n, 2): where the last transfer was to put the object, in mm; NaN if that was no place. ``external``: it is of
+    architecture A, in which a refusal ends nothing. ``symmetry_order``: of the block, 0 where the file does not say, as those of older
+    versions.
     """
 
     episode: Integers
@@ -36,7 +38,7 @@ class Trace(NamedTuple):
     goal: Floats
     before: Floats
     end: Floats
-    arm: Integers
+    arm: NDArray[np.str_]
     final: NDArray[np.bool_]
     outcome: Integers
     transfers: Integers
@@ -80,7 +82,7 @@ def read_trace(path: Path) -> Trace:
         goal=np.array([end["goal"] for end in ends], float),
         before=np.array([end["state"] for end in ends], float),
         end=np.array([end["next_state"] for end in ends], float),
-        arm=np.array([end["arm"] for end in ends], int),
+        arm=np.array([end["arm"] for end in ends], str),
         final=np.array([end["final"] for end in ends], bool),
         outcome=np.array([end["outcome"] or int(Outcome.TIMEOUT) for end in ends], int),
         transfers=np.array([count[number] for number in numbers], int),
@@ -107,13 +109,13 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
 
 
 def _step(row: dict[str, Any]) -> dict[str, Any]:
-    """A line's values, checked; outcome and arm as numbers."""
+    """A line's values, checked; the outcome as a number."""
     verdict = row["outcome"]
     return {
         "episode": int(row["episode"]),
         **{key: _numbers(row[key], 3) for key in ("state", "goal", "next_state")},
-        "place": _numbers(row["place"], 2),
-        "arm": ARM_LETTERS.index(row["arm"]),
+        "place": [math.nan, math.nan] if row["place"] is None else _numbers(row["place"], 2),
+        "arm": _arm(row),
         "final": bool(row["final"]),
         "outcome": 0 if verdict is None else int(Outcome[str(verdict).upper()]),
         "epsilon_rad": float(row["epsilon_rad"]),
@@ -128,6 +130,14 @@ def _numbers(value: Any, count: int) -> list[float]:
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise ValueError
     return numbers
+
+
+def _arm(row: dict[str, Any]) -> str:
+    """The arm's label: a letter of a mirrored pair; lines of other cells say a receiver, too."""
+    label = row["arm"]
+    if not isinstance(label, str) or not ("receiver" in row or label in ARM_LETTERS):
+        raise ValueError
+    return label
 
 
 def _order(value: Any) -> int:
@@ -169,6 +179,7 @@ def foreseen(trace: Trace, rules: Rules) -> Integers:
     ``rules`` are those of architecture B. A hand-over that they refuse ends as a wrong position, but in architecture A, where it goes on.
     """
     seen = np.where(trace.looped[:, None], as_seen(rules.cell, trace.before), trace.before)
-    placed, feasible = rules.transfer(seen, trace.goal, Command(trace.final, trace.arm, trace.place))
+    arms = np.array([arm_index(rules.cell, label) for label in trace.arm.tolist()], int)
+    placed, feasible = rules.transfer(seen, trace.goal, Command(trace.final, arms, trace.place))
     verdict = rules.judge(placed, trace.goal, trace.final, feasible, trace.epsilon_rad + ROUNDING_RAD)
     return np.where(trace.external & ~trace.final, int(Outcome.NONE), verdict.outcome)

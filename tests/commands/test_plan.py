@@ -236,7 +236,7 @@ def test_a_block_that_hits_the_arm_that_holds_it_is_too_wide(capsys):
 
 
 def test_motions_are_planned_only_when_asked_for():
-    code = "import sys; from marl_handover import cli; cli.main(['plan']); print('numba' in sys.modules)"
+    code = "import sys; from marl_handover import cli; cli.main(['plan']); print('marl_handover.motion.planner' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()[-1] == "False"
 
 
