@@ -45,7 +45,7 @@ COMMANDS: dict[str, Command] = {
     "evaluate": Command("play episodes with a policy: table, JSON, trace", "marl_handover.commands.evaluate"),
     "compare": Command("a suite of runs over seeds: statistics, tables, figures", "marl_handover.commands.compare"),
     "tune": Command("search for better settings of training, as an Optuna study", "marl_handover.commands.tune"),
-    "simulate": Command("play episodes in the PyBullet cell: text, MP4 or GIF", "marl_handover.commands.simulate"),
+    "simulate": Command("play episodes in simulated physics: text, MP4 or GIF", "marl_handover.commands.simulate"),
     "calibrate": Command("camera and servos of a cell, or of its twin: measured, saved and checked", "marl_handover.commands.calibrate"),
     "run": Command("the closed loop on hardware or its twin; dry_run=true moves nothing", "marl_handover.commands.run"),
     "stop": Command(

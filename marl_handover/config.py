@@ -30,8 +30,10 @@ from marl_handover.plugins import Registry
 __all__ = [
     "BACKENDS",
     "CELL_ALIASES",
+    "ENGINES",
     "LAYOUTS",
     "MAX_SEED",
+    "PHYSICS",
     "ArmConfig",
     "BlockConfig",
     "CellConfig",
@@ -70,11 +72,18 @@ BACKENDS: Registry[Any] = Registry(
         "kinematic": "marl_handover.envs.backends:KinematicBackend",
         "noisy": "marl_handover.envs.backends:NoisyBackend",
         "bullet": "marl_handover.simulation.backend:BulletBackend",
+        "mujoco": "marl_handover.simulation.backend:MujocoBackend",
         "twin": "marl_handover.control.hardware_backend:TwinBackend",
         "hardware": "marl_handover.control.hardware_backend:HardwareBackend",
     },
 )
 """Classes with the methods of :class:`~marl_handover.envs.backends.Backend`, called with a model, motion settings and own options."""
+ENGINES: Registry[Any] = Registry(
+    "engine", {"bullet": "marl_handover.simulation.bullet:BulletEngine", "mujoco": "marl_handover.simulation.mujoco:MujocoEngine"}
+)
+"""Physics engines: classes with the methods of :class:`~marl_handover.simulation.engine.Engine`."""
+PHYSICS = ("bullet", "mujoco")
+"""Backends that are nothing but one of them."""
 SHAPES = ("file", "links", "none")
 APPROACHES = ("", "+x", "-x", "+y", "-y", "+z", "-z")
 CHARTS = ("paper", "angle")

@@ -31,6 +31,17 @@ def pytest_configure():
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
+ENGINES = {"bullet": "pybullet", "mujoco": "mujoco"}
+"""Physics engines, and the packages that they need."""
+
+
+@pytest.fixture(scope="session", params=ENGINES)
+def engine(request):
+    """The name of each physics engine that is installed."""
+    pytest.importorskip(ENGINES[request.param])
+    return request.param
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _registry_of_tests(tmp_path_factory):
     """Sessions of tests stay off the user's session registry: they do not answer when somebody stops real arms meanwhile."""

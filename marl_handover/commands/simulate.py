@@ -1,4 +1,4 @@
-"""``marl-handover simulate``: episodes in PyBullet, to read and to watch. Each ends at the first verdict, as in the environments."""
+"""``marl-handover simulate``: episodes in simulated physics, to read and to watch. Each ends at the first verdict."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from marl_handover.cell import build_cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import (
     CELL_ALIASES,
+    ENGINES,
     POSE,
     CellConfig,
     MotionConfig,
@@ -34,7 +35,7 @@ from marl_handover.task.rules import Outcome
 if TYPE_CHECKING:
     from marl_handover.envs.handover_aec import HandoverEnv
     from marl_handover.motion.executor import ExecutorAgent
-    from marl_handover.simulation.backend import BulletBackend
+    from marl_handover.simulation.backend import PhysicsBackend
     from marl_handover.simulation.film import Film
     from marl_handover.task.rules import Rules
 
@@ -51,13 +52,14 @@ class SimulateCommand:
     cell: CellConfig | None = None  # single keys change the paper cell
     task: TaskChanges = field(default_factory=TaskChanges)  # but for the noise: physics decides
     motion: MotionConfig = field(default_factory=MotionConfig)
+    engine: str | None = chosen(None, ENGINES)  # bullet or mujoco; null: bullet where it is installed
     grasp: str | None = chosen(None, ("friction", "constraint"))  # of two pads; constraint: a rigid joint while both are on the pin
     video: str = path_field()  # .mp4 or .gif
     fps: float = bounded(12.5, 1.0, 50.0)  # of the video, in simulated time
     size: list[int] = bounded([640, 480], 16, 4096, (2, 2))  # of the video: width, height in pixels
     view: str = chosen("overview", ("overview", "top"))  # of the video: overview, or top (the cell's camera)
     captions: bool = True  # of the video: transfer, arm and error below the picture, what the arms reach on the table
-    gui: bool = False  # open PyBullet's window
+    gui: bool = False  # open the engine's window
     progress: bool = True
 
 
@@ -77,7 +79,7 @@ class Played(NamedTuple):
 
 def run(config: SimulateCommand) -> int:
     """Play, print, write. Raises :class:`WorkFailed` if an episode misses its goal."""
-    from marl_handover.simulation.backend import BulletBackend
+    from marl_handover.simulation.backend import PhysicsBackend
     from marl_handover.simulation.camera import view
     from marl_handover.simulation.film import picture_size
 
@@ -90,7 +92,7 @@ def run(config: SimulateCommand) -> int:
             policy.rules.cell.require_reached(name, pose)
     model = build_cell(policy.rules.cell.config)
     camera = view(config.view, model.cell)
-    backend = BulletBackend(model, config.motion, grasp=config.grasp, gui=config.gui, camera=camera, size=size)
+    backend = PhysicsBackend(model, config.motion, engine=config.engine, grasp=config.grasp, gui=config.gui, camera=camera, size=size)
     for note in backend.notes:
         print(note, file=sys.stderr)
     try:
@@ -124,7 +126,7 @@ def _check(config: SimulateCommand) -> None:
 
 
 @contextmanager
-def _recording(config: SimulateCommand, backend: BulletBackend, rules: Rules) -> Iterator[Film | None]:
+def _recording(config: SimulateCommand, backend: PhysicsBackend, rules: Rules) -> Iterator[Film | None]:
     """The film, if a video is asked for."""
     if not config.video:
         yield None
@@ -138,7 +140,7 @@ def _recording(config: SimulateCommand, backend: BulletBackend, rules: Rules) ->
 
 
 def _episodes(
-    config: SimulateCommand, policy: policies.SupervisorPolicy, model: Any, backend: BulletBackend, film: Film | None
+    config: SimulateCommand, policy: policies.SupervisorPolicy, model: Any, backend: PhysicsBackend, film: Film | None
 ) -> Iterator[Played]:
     from marl_handover.envs.handover_aec import raw_env
     from marl_handover.motion.executor import ExecutorAgent
@@ -169,7 +171,7 @@ def play(
     env: HandoverEnv,
     supervisor: policies.SupervisorPolicy,
     arms: dict[str, ExecutorAgent],
-    backend: BulletBackend,
+    backend: PhysicsBackend,
     say: Callable[[str], None],
     film: Film | None = None,
 ) -> Played:

@@ -19,6 +19,8 @@ from marl_handover.arrays import Floats, one_where, wrap
 from marl_handover.cell import Cell
 from marl_handover.config import (
     BACKENDS,
+    ENGINES,
+    PHYSICS,
     CellConfig,
     LoopConfig,
     MotionConfig,
@@ -66,7 +68,8 @@ class AssessmentConfig:
     seed: int = seed_field()  # of the problems, and of execution noise but for the twin, whose servos go on as they are
     cell: CellConfig | None = None  # single keys change the paper cell
     task: TaskChanges = field(default_factory=TaskChanges)  # task.noise left out: of noisy, 1 mm and 0.5 deg
-    grasp: str | None = chosen(None, ("friction", "constraint"))  # of bullet: friction or constraint; null: friction where that holds
+    grasp: str | None = chosen(None, ("friction", "constraint"))  # of bullet and mujoco; null: friction where that holds
+    engine: str | None = chosen(None, ENGINES)  # of twin: its physics, bullet or mujoco; null: bullet where it is installed
     missed_grasps: float | None = bounded(None, 0.0, 1.0)  # of noisy: probability that the fingers close on nothing; null: 0.01
     loop: LoopConfig = field(default_factory=LoopConfig)  # of all but kinematic
     motion: MotionConfig = field(default_factory=MotionConfig)  # of all but kinematic
@@ -225,13 +228,13 @@ def backend_options(config: AssessmentConfig) -> dict[str, Any]:
     """What was asked of the backend. Raises :class:`InvalidSetting` for what another one would take."""
     if config.backend == "kinematic":
         for key, value in changed("loop", config.loop) + changed("motion", config.motion):
-            raise InvalidSetting(key, value, "left out with backend=kinematic, which plans no motions; or backend=noisy or bullet")
-    owners = {"grasp": "bullet", "missed_grasps": "noisy", "calibration": "twin", "hardware": "twin"}
+            raise InvalidSetting(key, value, "left out with backend=kinematic, which plans no motions; or backend=noisy, bullet or mujoco")
+    owners = {"grasp": PHYSICS, "missed_grasps": ("noisy",), "calibration": ("twin",), "hardware": ("twin",), "engine": ("twin",)}
     given = {name: getattr(config, name) for name in owners if getattr(config, name) is not None}
     for name, value in given.items():
-        if owners[name] != config.backend:
-            raise InvalidSetting(name, value, f"left out, or backend={owners[name]}")
-    if config.backend in ("bullet", "twin") and config.task.noise is not None:
+        if config.backend not in owners[name]:
+            raise InvalidSetting(name, value, f"left out, or backend={' or '.join(owners[name])}")
+    if config.backend in (*PHYSICS, "twin") and config.task.noise is not None:
         raise InvalidSetting("task.noise", asdict(config.task.noise), f"left out with backend={config.backend}, where physics decides")
     if config.backend == "noisy" and config.task.noise is not None:
         if config.task.noise.observed:

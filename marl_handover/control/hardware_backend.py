@@ -280,15 +280,24 @@ class TwinBackend(HardwareBackend):
         motion: how the arms move.
         calibration: folder of what ``calibrate`` wrote; None: the usual one.
         hardware: its electronics; None: as they are shipped.
+        engine: its physics, by name; None: PyBullet where it is installed, else MuJoCo.
 
     Raises:
+        MissingExtra: the engine is not installed.
         MissingFile: it was not calibrated.
     """
 
     def __init__(
-        self, model: CellModel, motion: MotionConfig, *, calibration: str | None = None, hardware: HardwareConfig | None = None
+        self,
+        model: CellModel,
+        motion: MotionConfig,
+        *,
+        calibration: str | None = None,
+        hardware: HardwareConfig | None = None,
+        engine: str | None = None,
     ) -> None:
         config = twin_workcell()
+        config.twin.engine = engine
         if hardware is not None:
             config.hardware = replace(hardware, name=TWIN)
         config.calibration = calibration or ""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from marl_handover.compose import from_yaml
-from marl_handover.config import bounded, check_bounds, path_field, require_between, seed_field
+from marl_handover.config import ENGINES, bounded, check_bounds, chosen, path_field, require_between, seed_field
 from marl_handover.errors import InvalidSetting
 from marl_handover.files import resource_path
 from marl_handover.hardware.settings import ARMS, TWIN, HardwareConfig
@@ -55,6 +55,7 @@ class TwinConfig:
     """What the twin's people and glue are like, beside its servos (``hardware.emulator``) and its camera (``mount``, ``look``)."""
 
     seed: int = seed_field()  # of the camera's noise and of what people do
+    engine: str | None = chosen(None, ENGINES)  # its physics, bullet or mujoco; null: bullet where it is installed
     card_sd_mm: float = bounded(0.3, 0.0, 20.0)  # how exactly the marker cards are glued onto the hands
     card_sd_deg: float = bounded(0.5, 0.0, 45.0)
     board_sd_mm: float = bounded(0.3, 0.0, 20.0)  # how exactly the calibration board is laid onto its marks

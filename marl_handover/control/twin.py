@@ -26,7 +26,7 @@ from marl_handover.perception.printables import Sheet, marker_sheet
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.simulation.arm import SERVO_S
 from marl_handover.simulation.follower import ServoFollower, ServoState
-from marl_handover.simulation.world import BulletCell
+from marl_handover.simulation.world import SimulatedCell
 
 _BOOTED_S = 1.0
 _HAND_STEP_S, _HAND_S = 0.02, 1.0
@@ -55,7 +55,7 @@ class Twin:
             boards={name: replace(board, port=ports.get(name, board.port), scan=False) for name, board in config.hardware.boards.items()},
         )
         """The electronics' settings, their ports those of the emulated boards."""
-        self.cell = BulletCell(model, motion)
+        self.cell = SimulatedCell(model, motion, engine=config.twin.engine)
         self.follower = ServoFollower(self.cell, self._servos)
         truth = hung_camera(config.mount, (config.camera.width_px, config.camera.height_px))
         self.painter = CellPainter(model, truth, config.target, config.look, config.twin.seed)

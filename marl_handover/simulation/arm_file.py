@@ -20,7 +20,7 @@ DENSITY_KG_MM3, LEAST_KG = 700e-9, 2e-3
 """Of links whose URDF says no mass: a servo in its bracket, its box counted full; and what a link without a shape weighs."""
 
 _AROUND_MM = 10.0  # radius of a ball whose moments a link without a shape gets
-_GREY = (0.7, 0.72, 0.75, 1.0)
+GREY = (0.7, 0.72, 0.75, 1.0)
 
 
 @lru_cache(maxsize=16)
@@ -112,10 +112,10 @@ def _link(link: Link) -> str:
     parts = [f'<inertial>{origin}<mass value="{link.inertial.mass_kg!r}"/><inertia {moments}/></inertial>']
     seen = [visual for visual in link.visuals if not isinstance(visual.shape, Mesh) or visual.shape.path.is_file()]
     for visual in seen:
-        parts.append(_shape("visual", visual.shape, visual.rgba or _GREY))
+        parts.append(_shape("visual", visual.shape, visual.rgba or GREY))
     for shape in link.collisions:
         if not seen:
-            parts.append(_shape("visual", shape, _GREY))
+            parts.append(_shape("visual", shape, GREY))
         parts.append(_shape("collision", shape))
     return f"<link name={quoteattr(link.name)}>{''.join(parts)}</link>"
 
@@ -138,22 +138,27 @@ def _colour_name(rgba: tuple[float, float, float, float]) -> str:
     return "_".join(f"{value:.4f}" for value in rgba)
 
 
-def _joint(description: ArmDescription, joint: Joint) -> str:
+def mounted(description: ArmDescription, joint: Joint) -> Joint:
     """An arm's joint and its gripper's as they are; what else might move is fixed where it is."""
     missing = {role for role, source in zip(ARM_JOINTS, description.sources, strict=True) if source.joint is None}
-    moves = joint.name in description.gripper.joints or (joint.name in ARM_JOINTS and joint.name not in missing)
-    xyz_mm, kind = joint.xyz_mm, joint.kind if moves else "fixed"
-    if kind == "fixed" and joint.kind == "prismatic" and joint.lower:
+    if joint.name in description.gripper.joints or (joint.name in ARM_JOINTS and joint.name not in missing):
+        return replace(joint, kind="revolute") if joint.kind == "continuous" else joint
+    xyz_mm = joint.xyz_mm
+    if joint.kind == "prismatic" and joint.lower:
         xyz_mm = _vector((transform(joint.xyz_mm, joint.rpy_rad) @ np.append(joint.lower * np.asarray(joint.axis), 1.0))[:3])
-    ends = f"<parent link={quoteattr(joint.parent)}/><child link={quoteattr(joint.child)}/>{_origin(xyz_mm, joint.rpy_rad)}"
-    if kind == "fixed":
+    return replace(joint, kind="fixed", xyz_mm=xyz_mm)
+
+
+def _joint(description: ArmDescription, joint: Joint) -> str:
+    joint = mounted(description, joint)
+    ends = f"<parent link={quoteattr(joint.parent)}/><child link={quoteattr(joint.child)}/>{_origin(joint.xyz_mm, joint.rpy_rad)}"
+    if joint.kind == "fixed":
         return f'<joint name={quoteattr(joint.name)} type="fixed">{ends}</joint>'
-    scale = 1e-3 if kind == "prismatic" else 1.0
+    scale = 1e-3 if joint.kind == "prismatic" else 1.0
     limits = f'lower="{scale * joint.lower!r}" upper="{scale * joint.upper!r}"'
     limits += f' effort="{joint.effort!r}" velocity="{scale * joint.velocity!r}"'
     axis = " ".join(repr(float(value)) for value in joint.axis)
-    kind = "revolute" if kind == "continuous" else kind
-    return f'<joint name={quoteattr(joint.name)} type="{kind}">{ends}<axis xyz="{axis}"/><limit {limits}/></joint>'
+    return f'<joint name={quoteattr(joint.name)} type="{joint.kind}">{ends}<axis xyz="{axis}"/><limit {limits}/></joint>'
 
 
 def _origin(xyz_mm: Vector, rpy_rad: Vector) -> str:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from marl_handover.arrays import Floats
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.envs.backends import Execution
@@ -15,8 +17,7 @@ from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
 from marl_handover.motion.pick_place import timed_phases
 from marl_handover.motion.trajectory import Phase, PickPlacePaths
 from marl_handover.simulation.camera import TOP, Camera
-from marl_handover.simulation.engine import Floats
-from marl_handover.simulation.world import BulletCell, RunReport
+from marl_handover.simulation.world import RunReport, SimulatedCell
 
 UPRIGHT_RAD = math.radians(3.0)
 """A block that leans more than this has tipped over."""
@@ -24,8 +25,8 @@ UPRIGHT_RAD = math.radians(3.0)
 _PICTURE_WIDTH, _PICTURE_HEIGHT = 640, 360
 
 
-class BulletBackend:
-    """Transfers carried out in PyBullet, measured by ground truth.
+class PhysicsBackend:
+    """Transfers carried out in simulated physics, measured by ground truth.
 
     A cycle that makes no sense (:class:`CycleCheck`) is refused and nothing moves. One that fails on the way is carried out to its end, so
     that the arm parks, and the object is reported where it came to lie.
@@ -33,8 +34,9 @@ class BulletBackend:
     Args:
         model: the cell.
         motion: degree, limits and times of the motion.
-        grasp: "friction", "constraint" or None, as for :class:`BulletCell`.
-        gui: open PyBullet's window.
+        engine: by name; None: PyBullet where it is installed, else MuJoCo.
+        grasp: "friction", "constraint" or None, as for :class:`SimulatedCell`.
+        gui: open the engine's window.
         camera: what :meth:`render` looks through.
         size: width and height of its pictures.
     """
@@ -46,6 +48,7 @@ class BulletBackend:
         model: CellModel,
         motion: MotionConfig,
         *,
+        engine: str | None = None,
         grasp: str | None = None,
         gui: bool = False,
         camera: Camera = TOP,
@@ -53,7 +56,7 @@ class BulletBackend:
     ) -> None:
         self.model, self.motion, self.camera, self.size = model, motion, camera, size
         self.check = CycleCheck(model, motion)
-        self.cell = BulletCell(model, motion, grasp=grasp, gui=gui)
+        self.cell = SimulatedCell(model, motion, engine=engine, grasp=grasp, gui=gui)
         self.on_step: Callable[[], None] | None = None
         """Called every 20 ms of simulated time while arms move."""
         self.last: RunReport | None = None
@@ -104,5 +107,9 @@ class BulletBackend:
         return self.cell.camera_image(*self.size, self.camera)
 
     def close(self) -> None:
-        """Let the physics client go."""
+        """Let the world go."""
         self.cell.close()
+
+
+BulletBackend = partial(PhysicsBackend, engine="bullet")
+MujocoBackend = partial(PhysicsBackend, engine="mujoco")

@@ -1,4 +1,4 @@
-"""Cameras of the simulated cell, drawn by PyBullet's software renderer: they need no display."""
+"""Cameras of the simulated cell: what each engine draws looks through one of them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.cell.cell import Cell
-from marl_handover.config import require_at_least
-from marl_handover.simulation.engine import Engine, length, pybullet
 
 Pixels = NDArray[np.uint8]
 
@@ -48,28 +46,25 @@ def view(name: str, cell: Cell) -> Camera:
     return _OVERVIEW._replace(eye_mm=(farther * eye_x, eye_y, farther * eye_z), target_mm=(farther * x, y, z))
 
 
-_NEAR_MM, _FAR_MM = 50.0, 3000.0
-_LIGHT = (0.4, -0.3, 1.0)
+NEAR_MM, _FAR_MM = 50.0, 3000.0
+"""Nearer than this nothing is drawn."""
+
+LIGHT = (0.4, -0.3, 1.0)
+"""Towards the light."""
 
 
-def picture(engine: Engine, camera: Camera, width: int, height: int) -> Pixels:
-    """What ``camera`` sees now: RGB (height, width, 3). Raises :class:`InvalidSetting` for a size below 1."""
-    require_at_least("width", width, 1)
-    require_at_least("height", height, 1)
-    eye, target = ([length(value) for value in point] for point in (camera.eye_mm, camera.target_mm))
-    far_mm = max(_FAR_MM, 2 * float(np.linalg.norm(camera.eye_mm)))
-    pixel = length(_NEAR_MM) / camera.focal_px * max(camera.width_px / width, camera.height_px / height)
-    half_width, half_height = pixel * width / 2, pixel * height / 2
-    _, _, pixels, _, _ = pybullet.getCameraImage(
-        width,
-        height,
-        viewMatrix=pybullet.computeViewMatrix(eye, target, camera.up),
-        projectionMatrix=pybullet.computeProjectionMatrix(
-            -half_width, half_width, -half_height, half_height, length(_NEAR_MM), length(far_mm)
-        ),
-        lightDirection=_LIGHT,
-        shadow=0,
-        renderer=pybullet.ER_TINY_RENDERER,
-        physicsClientId=engine.client,
-    )
-    return np.ascontiguousarray(np.reshape(np.asarray(pixels, dtype=np.uint8), (height, width, 4))[..., :3])
+def far_mm(camera: Camera) -> float:
+    """Farther than this nothing is drawn."""
+    return max(_FAR_MM, 2 * float(np.linalg.norm(camera.eye_mm)))
+
+
+def frustum_mm(camera: Camera, width: int, height: int) -> tuple[float, float]:
+    """Half of the width and of the height of what a picture of ``width`` x ``height`` pixels shows, :data:`NEAR_MM` before the eye."""
+    pixel = NEAR_MM / camera.focal_px * max(camera.width_px / width, camera.height_px / height)
+    return pixel * width / 2, pixel * height / 2
+
+
+def strip_triangles(count: int) -> NDArray[np.int64]:
+    """The triangles (n, 3) of a strip between two edges of ``count`` points each, which are numbered one edge after the other."""
+    first = np.arange(count - 1)
+    return np.stack([first, first + 1, first + count, first + 1, first + count + 1, first + count], -1).reshape(-1, 3)

@@ -1,89 +1,41 @@
-"""One PyBullet world of its own, its constants, and the change of units between it and the package.
-
-The world is blown up by :data:`SCALE`: Bullet's collision tolerances are made for bodies of decimetres, and a pin 2.5 mm thick is finer
-than they are. Only this module knows the factor. Masses and seconds stay, so forces grow by it, torques and inertias by its square.
-"""
+"""What a physics engine does for the simulated cell. Each engine is one file, found by its name; nothing here knows any of them."""
 
 from __future__ import annotations
 
-import ctypes
-import math
+import importlib.util
 import os
 import sys
-import weakref
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
-from typing import Any, NamedTuple, Never
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, Never, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-from marl_handover.errors import HandoverError, UrdfError, WorkFailed
+from marl_handover.arrays import Floats
+from marl_handover.config import ENGINES, BlockConfig
+from marl_handover.errors import HandoverError, MissingExtra, WorkFailed
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.se2 import SE2
+from marl_handover.simulation.camera import Camera, Pixels
 
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Nothing that C code prints in this block comes out; what was printed before does, and in its order."""
-    try:
-        kept = {number: os.dup(number) for number in (1, 2)}
-    except OSError:  # no standard streams, nothing to silence
-        yield
-        return
-    _flush()
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            for number in kept:
-                os.dup2(nowhere.fileno(), number)
-        yield
-    finally:
-        _flush()
-        for number, copy in kept.items():
-            os.dup2(copy, number)
-            os.close(copy)
-
-
-def _flush() -> None:
-    """Empty the buffers of Python's streams and of C's."""
-    for stream in (sys.stdout, sys.stderr):
-        if stream is not None:
-            stream.flush()
-    with suppress(OSError, TypeError, AttributeError):  # a system without a C library in the process
-        ctypes.CDLL(None).fflush(None)
-
-
-with _silent():  # it prints when it was built; the package's other modules take it from here
-    import pybullet
-
-Floats = NDArray[np.float64]
-
-SCALE = 10.0
-_UNITS_PER_MM = SCALE / 1000.0
-
-
-class Pace(NamedTuple):
-    """How finely time is cut, and how long the solver works on each piece."""
-
-    step_s: float
-    iterations: int
-
-
-COARSE = Pace(1 / 250, 50)
-"""For arms that move in free air, and a block that stands."""
-
-FINE = Pace(1 / 1000, 300)
-"""For fingers on a thin pin: with less, the solver's leftover forces turn the block in the grip when the hand pitches on the way."""
-
-_GRAVITY_M_S2 = 9.81
+TABLE, BLOCK = -1, -2
+"""Bodies that touch are an arm's number, or one of these."""
 
 
 class NoWindow(WorkFailed):
-    """PyBullet cannot open its window."""
+    """The engine cannot open its window."""
 
     exit_status = 2
 
-    def __init__(self) -> None:
-        super().__init__("gui = true: PyBullet's window needs a display, and DISPLAY is not set; use gui=false, and video=FILE")
+    def __init__(self, engine: str) -> None:
+        super().__init__(f"gui = true: the window of {engine} needs a display, and DISPLAY is not set; use gui=false, and video=FILE")
+
+
+class NoRenderer(HandoverError):
+    """Nothing on this machine can draw the engine's pictures."""
+
+    def __init__(self, engine: str) -> None:
+        super().__init__(f"pictures of {engine} need OpenGL (EGL or OSMesa), or PyBullet; run: apt-get install libegl1 libgl1-mesa-dri")
 
 
 class WorldClosed(WorkFailed):
@@ -100,164 +52,169 @@ class WorldNotCopied(HandoverError, TypeError):
         super().__init__("a simulated world cannot be copied or pickled; make another environment, and reset it with the same seed")
 
 
-class Surface(NamedTuple):
-    """Friction of a body's surface; Bullet multiplies the lateral values of two that touch.
-
-    ``patch_mm`` stands for the radius of a soft contact patch, which resists rolling and spinning.
-    """
-
-    lateral: float
-    patch_mm: float = 0.0
-
-
-class Touch(NamedTuple):
-    """Two links that touch; link -1 is a body's base. ``distance_mm`` is negative where they overlap."""
-
-    first: tuple[int, int]
-    second: tuple[int, int]
-    distance_mm: float
-    force_n: float
-
-
-class Engine:
-    """A physics client. Several live side by side in one process; each call names its own.
-
-    It is let go when the engine is closed or nobody holds it any more. It cannot be copied: two engines would share one world.
-
-    Raises:
-        NoWindow: if ``gui`` and there is no display.
-    """
-
-    def __init__(self, gui: bool = False) -> None:
-        # Without a display PyBullet does not fail, it ends the process.
-        if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-            raise NoWindow()
-        try:
-            client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
-        except pybullet.error as error:
-            raise NoWindow() from error
-        if client < 0:
-            raise NoWindow()
-        self._client = client
-        self._connection = weakref.finalize(self, _disconnect, client)
-        self.time_s = 0.0
-
-    @property
-    def client(self) -> int:
-        """The number by which PyBullet knows this world. It gives the number to another world later.
-
-        Raises:
-            WorldClosed: after :meth:`close`.
-        """
-        if not self._connection.alive:
-            raise WorldClosed()
-        return self._client
+class NotCopied:
+    """What owns a world, and so cannot be copied: two would share one."""
 
     def __reduce__(self) -> Never:
         raise WorldNotCopied()
 
-    def clear(self) -> None:
-        """An empty world at time 0, as if just connected: nothing of what went before is left to influence what comes."""
-        pybullet.resetSimulation(physicsClientId=self.client)
-        pybullet.setGravity(0, 0, -_GRAVITY_M_S2 * SCALE, physicsClientId=self.client)
-        pybullet.setPhysicsEngineParameter(numSubSteps=0, deterministicOverlappingPairs=1, physicsClientId=self.client)
-        self.pace(COARSE)
-        self.time_s = 0.0
 
-    def pace(self, pace: Pace) -> None:
-        """Cut time this finely from now on."""
-        self._step_s = pace.step_s
-        pybullet.setPhysicsEngineParameter(fixedTimeStep=pace.step_s, numSolverIterations=pace.iterations, physicsClientId=self.client)
+class Units(NamedTuple):
+    """Lengths of an engine's world, which may be blown up by ``scale``. Masses and seconds stay, so forces grow by it, torques and inertias
+    by its square.
+    """
+
+    scale: float = 1.0
+
+    def length(self, mm: float) -> float:
+        """Millimetres as the world's length."""
+        return mm * (self.scale / 1000.0)
+
+    def to_mm(self, world: Iterable[float]) -> Floats:
+        """World lengths as millimetres."""
+        return np.asarray(list(world), dtype=float) / (self.scale / 1000.0)
+
+    def force(self, newtons: float) -> float:
+        """A force as the world has it."""
+        return newtons * self.scale
+
+    def torque(self, newton_metres: float) -> float:
+        """A torque as the world has it."""
+        return newton_metres * self.scale**2
+
+    def inertia(self, kg_mm2: float) -> float:
+        """A moment of inertia as the world has it."""
+        return kg_mm2 * 1e-6 * self.scale**2
+
+
+class Touch(NamedTuple):
+    """Two links that touch, by name; the block and the table have none. ``distance_mm`` is negative where they overlap."""
+
+    first: str
+    second: str
+    distance_mm: float
+    force_n: float
+
+
+class Servo(NamedTuple):
+    """A joint that is driven: the engine's number of it, and the most that its motor does, in the engine's units."""
+
+    joint: int
+    effort: float
+    velocity: float
+
+
+class Scene(NamedTuple):
+    """What stands in a world.
+
+    ``passes``: of each arm, whether nothing comes of touches between its hand and the block. ``table_mm``: half of the table's side.
+    """
+
+    arms: Sequence[ArmModel]
+    bases: Sequence[SE2]
+    block: BlockConfig
+    passes: Sequence[bool]
+    table_mm: float = 1000.0
+
+
+class Engine(Protocol):
+    """A world of its own, with a table, arms and the block in it. Several live side by side in one process.
+
+    Equal calls after :meth:`reset` give bit-identical states. A world is let go when it is closed or nobody holds it any more, and it
+    cannot be copied. Every method raises :class:`WorldClosed` after :meth:`close`. Joint values, lengths, speeds and forces that servos
+    have are in the engine's :attr:`units`; everything else is in mm, rad and N.
+
+    Made of a :class:`Scene`, and of whether a window is to open; raises :class:`NoWindow` if that cannot be, :class:`UrdfError` for an arm
+    that the engine cannot take.
+    """
+
+    units: Units
+    time_s: float
+    """How much time has passed."""
+
+    def __init__(self, scene: Scene, gui: bool = False) -> None: ...
+
+    def reset(self) -> None:
+        """The world as if it had just been made, at time 0: nothing of what went before is left to influence what comes."""
+
+    def fine(self, fine: bool) -> None:
+        """Cut time from now on for fingers on a thin pin; or coarsely, for arms in free air and a block that stands."""
 
     def advance(self, seconds: float) -> None:
         """Let time pass, in whole steps."""
-        steps = round(seconds / self._step_s)
-        client = self.client
-        for _ in range(steps):
-            pybullet.stepSimulation(physicsClientId=client)
-        self.time_s += steps * self._step_s
 
     def close(self) -> None:
-        """Disconnect; a second call does nothing."""
-        self._connection()
+        """Let the world go; a second call does nothing."""
 
-    def load_arm(self, path: Path, x_mm: float, y_mm: float, yaw_rad: float, *, touches_itself: bool = True) -> int:
-        """A URDF with its base fixed to the table; gives the body's number. ``touches_itself``: whether its links stop each other.
+    def joint(self, arm: int, name: str) -> int:
+        """The engine's number of an arm's joint."""
 
-        Raises:
-            UrdfError: PyBullet cannot load it.
-        """
-        try:
-            body = pybullet.loadURDF(
-                str(path),
-                basePosition=[length(x_mm), length(y_mm), 0.0],
-                baseOrientation=pybullet.getQuaternionFromEuler([0.0, 0.0, yaw_rad]),
-                useFixedBase=True,
-                globalScaling=SCALE,
-                flags=pybullet.URDF_USE_INERTIA_FROM_FILE | (pybullet.URDF_USE_SELF_COLLISION if touches_itself else 0),
-                physicsClientId=self.client,
-            )
-        except pybullet.error as error:
-            raise UrdfError(path, "PyBullet cannot load it; every mesh it names has to be there, as .obj, .stl or .dae") from error
-        for link in range(pybullet.getNumJoints(body, physicsClientId=self.client)):
-            # globalScaling leaves inertias as the file has them.
-            inertia = pybullet.getDynamicsInfo(body, link, physicsClientId=self.client)[2]
-            self.dynamics(body, link, localInertiaDiagonal=[SCALE**2 * value for value in inertia], linearDamping=0.0, angularDamping=0.0)
-        return int(body)
+    def set_joint(self, arm: int, joint: int, value: float) -> None:
+        """Put a joint there at rest, without moving through the room."""
 
-    def dynamics(self, body: int, link: int, **changes: Any) -> None:
-        """``changeDynamics`` in this client; values in the world's own units."""
-        pybullet.changeDynamics(body, link, physicsClientId=self.client, **changes)
+    def drive(self, arm: int, servo: Servo, position: float, velocity: float, gain: float) -> None:
+        """A set-point of a servo: where its joint should be, its speed from there; ``gain``: part of an error that it removes in a step."""
 
-    def coat(self, body: int, links: Iterable[int], surface: Surface) -> None:
-        """Give links of a body a surface."""
-        for link in links:
-            self.dynamics(
-                body,
-                link,
-                lateralFriction=surface.lateral,
-                spinningFriction=length(surface.patch_mm),
-                rollingFriction=length(surface.patch_mm),
-            )
+    def joint_values(self, arm: int, joints: Sequence[int]) -> list[float]:
+        """Where joints are."""
 
-    def touches(self, first: int, second: int, first_link: int | None = None) -> list[Touch]:
-        """Where two bodies touched in the last step."""
-        only = {} if first_link is None else {"linkIndexA": first_link}
-        found = pybullet.getContactPoints(bodyA=first, bodyB=second, physicsClientId=self.client, **only) or ()
-        return [Touch((hit[1], hit[3]), (hit[2], hit[4]), hit[8] / _UNITS_PER_MM, hit[9] / SCALE) for hit in found]
+    def grip_mm(self, arm: int) -> Floats:
+        """Where an arm's grasp frame is in the world (3,)."""
 
+    def put_block(self, xyz_mm: Sequence[float], rpy_rad: Sequence[float]) -> None:
+        """Put the block's frame there (3,), turned by roll, pitch and yaw (3,), at rest."""
 
-def _disconnect(client: int) -> None:
-    with suppress(pybullet.error):  # whose window was closed by hand
-        pybullet.disconnect(physicsClientId=client)
+    def block_transform(self) -> Floats:
+        """T_world_block (4, 4) in mm, wherever it is, upright or not."""
+
+    def touches(self, first: int, second: int, link: str | None = None) -> list[Touch]:
+        """Where two bodies touched in the last step; ``link``: only where this one of the first did."""
+
+    def bond(self, arm: int) -> None:
+        """A rigid joint between an arm's hand and the block as they are now."""
+
+    def release(self, arm: int) -> None:
+        """Take the rigid joint away."""
+
+    def picture(self, camera: Camera, width: int, height: int) -> Pixels:
+        """What ``camera`` sees now: RGB (height, width, 3). Raises :class:`NoRenderer`."""
+
+    def lay(self, one_mm: Floats, other_mm: Floats, height_mm: float, rgb: ArrayLike) -> None:
+        """A flat strip between two edges (n, 2), to be seen only, until the next reset."""
+
+    def paint_base(self, arm: int, rgb: ArrayLike) -> None:
+        """Colour an arm's base and what turns on it, until the next reset."""
+
+    def save(self) -> Any:
+        """All that the future depends on, for :meth:`restore` of this world until its next reset."""
+
+    def restore(self, state: Any) -> None:
+        """Go back to what :meth:`save` gave. Nothing has touched anything yet."""
 
 
-def length(mm: float) -> float:
-    """Millimetres as the world's length."""
-    return mm * _UNITS_PER_MM
+def default_engine() -> str:
+    """The engine that is taken where none is named: PyBullet where it is installed, else MuJoCo."""
+    return "bullet" if importlib.util.find_spec("pybullet") else "mujoco"
 
 
-def to_mm(world: Iterable[float]) -> Floats:
-    """World lengths as millimetres."""
-    return np.asarray(list(world), dtype=float) / _UNITS_PER_MM
+def open_engine(name: str | None, scene: Scene, gui: bool = False) -> Engine:
+    """A world of the engine ``name``; None: :func:`default_engine`.
+
+    Raises:
+        UnknownChoice: there is no such engine.
+        MissingExtra: it is not installed.
+        NoWindow, UrdfError: as the engine does.
+    """
+    engine: Engine = ENGINES[name or default_engine()](scene, gui)
+    return engine
 
 
-def force(newtons: float) -> float:
-    """A force as the world has it."""
-    return newtons * SCALE
+def require_display(engine: str) -> None:
+    """Raise :class:`NoWindow` where a window cannot be opened."""
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        raise NoWindow(engine)
 
 
-def torque(newton_metres: float) -> float:
-    """A torque as the world has it."""
-    return newton_metres * SCALE**2
-
-
-def inertia(kg_mm2: float) -> float:
-    """A moment of inertia as the world has it."""
-    return kg_mm2 * 1e-6 * SCALE**2
-
-
-def tilt_of(quaternion: Iterable[float]) -> float:
-    """Angle between a body's z axis and the vertical."""
-    rotation = pybullet.getMatrixFromQuaternion(list(quaternion))
-    return math.acos(min(1.0, max(-1.0, rotation[8])))
+def missing_engine(name: str, package: str) -> MissingExtra:
+    """What is said of an engine that is not installed."""
+    return MissingExtra(f"the physics engine {name}", package, name)

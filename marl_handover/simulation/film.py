@@ -16,29 +16,26 @@ from PIL import Image, ImageDraw, ImageFont
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.palette import FAINT, GREY, INK, OUTCOMES, PAPER, SHARED, YELLOW, arm_colour
-from marl_handover.simulation.backend import BulletBackend
+from marl_handover.simulation.backend import PhysicsBackend
+from marl_handover.simulation.block import TABLE_RGB
 from marl_handover.simulation.camera import Pixels
-from marl_handover.simulation.engine import Engine, length, pybullet
 from marl_handover.simulation.video import FrameClock, Video
-from marl_handover.simulation.world import CONTROL_S, BulletCell
+from marl_handover.simulation.world import CONTROL_S, SimulatedCell
 
 Floats = NDArray[np.float64]
 
 _TINT, _SHARED_TINT = 0.22, 0.4
-_TABLE = np.array([0.93, 0.93, 0.91])
 _STRIP = 96
 
 
-def dress(cell: BulletCell) -> None:
+def dress(cell: SimulatedCell) -> None:
     """Tint the sectors of the table that the arms reach and the part they share, and colour the bases, until the next reset."""
     model = cell.model.cell
-    for index, arm in enumerate(cell.arms):
+    for index in range(len(cell.arms)):
         colour = arm_colour(index)
-        _lay(cell.engine, *_sector_mm(model, index), 0.1 + 0.05 * index, _tinted(colour, _TINT))
-        for link in (-1, 0):
-            rgba = [*_rgb(colour), 1.0]
-            pybullet.changeVisualShape(arm.body, link, rgbaColor=rgba, physicsClientId=cell.engine.client)
-    _lay(cell.engine, *_shared_mm(model), 0.2, _tinted(SHARED, _SHARED_TINT))
+        cell.engine.lay(*_sector_mm(model, index), 0.1 + 0.05 * index, _tinted(colour, _TINT))
+        cell.engine.paint_base(index, _rgb(colour))
+    cell.engine.lay(*_shared_mm(model), 0.2, _tinted(SHARED, _SHARED_TINT))
 
 
 def _sector_mm(cell: Cell, arm: int) -> tuple[Floats, Floats]:
@@ -57,31 +54,13 @@ def _shared_mm(cell: Cell) -> tuple[Floats, Floats]:
     return np.asarray(cell.shared.to_table(along, 0 * along - 1)), np.asarray(cell.shared.to_table(along, 0 * along + 1))
 
 
-def _lay(engine: Engine, one_mm: Floats, other_mm: Floats, height_mm: float, rgb: Floats) -> None:
-    """A flat strip between two edges, seen from both sides."""
-    edges = np.concatenate([one_mm, other_mm])
-    vertices = [[length(x), length(y), 0.0] for x, y in edges]
-    first = np.arange(len(one_mm) - 1)
-    corners = np.stack([first, first + 1, first + len(one_mm), first + 1, first + len(one_mm) + 1, first + len(one_mm)], -1).reshape(-1, 3)
-    indices = np.concatenate([corners, corners[:, ::-1]]).ravel().tolist()
-    shape = pybullet.createVisualShape(
-        pybullet.GEOM_MESH,
-        vertices=vertices,
-        indices=indices,
-        normals=[[0, 0, 1]] * len(vertices),
-        rgbaColor=[*rgb, 1.0],
-        physicsClientId=engine.client,
-    )
-    pybullet.createMultiBody(baseMass=0, baseVisualShapeIndex=shape, basePosition=[0, 0, length(height_mm)], physicsClientId=engine.client)
-
-
 def _rgb(colour: str) -> Floats:
     return np.array([int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5)])
 
 
 def _tinted(colour: str, share: float) -> Floats:
     """The table with so much of a colour over it."""
-    return share * _rgb(colour) + (1 - share) * _TABLE
+    return share * _rgb(colour) + (1 - share) * np.array(TABLE_RGB)
 
 
 _LINES_A_PICTURE, _WIDTH_A_LETTER = 21.0, 37.0
@@ -201,7 +180,7 @@ class Film:
     """
 
     def __init__(
-        self, video: Video, fps: float, backend: BulletBackend, size: tuple[int, int], captions: bool, error: OrientationError
+        self, video: Video, fps: float, backend: PhysicsBackend, size: tuple[int, int], captions: bool, error: OrientationError
     ) -> None:
         self._video, self._fps, self._backend, self._size, self._captions = video, fps, backend, size, captions
         self._error = error
@@ -253,7 +232,7 @@ class Film:
 
 @contextmanager
 def filming(
-    path: Path | str, fps: float, backend: BulletBackend, size: tuple[int, int], captions: bool, error: OrientationError
+    path: Path | str, fps: float, backend: PhysicsBackend, size: tuple[int, int], captions: bool, error: OrientationError
 ) -> Iterator[Film]:
     """A :class:`Film` that gets a picture whenever one is due while arms move; the file appears when the block ends without an error."""
     with Video(path, fps) as video:

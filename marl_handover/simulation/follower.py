@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from marl_handover.arrays import Floats
 from marl_handover.simulation.arm import SERVO_S
-from marl_handover.simulation.engine import COARSE, FINE, Floats, Touch
-from marl_handover.simulation.world import CONTROL_S, BulletCell
+from marl_handover.simulation.engine import Touch
+from marl_handover.simulation.world import CONTROL_S, SimulatedCell
 
 _LOOK_EVERY = round(CONTROL_S / SERVO_S)
 _OPEN_SLACK_MM = 0.5
@@ -35,7 +36,7 @@ class ServoFollower:
         t_s: the time now.
     """
 
-    def __init__(self, cell: BulletCell, servos: Callable[[float], ServoState], t_s: float = 0.0) -> None:
+    def __init__(self, cell: SimulatedCell, servos: Callable[[float], ServoState], t_s: float = 0.0) -> None:
         self.cell, self._servos = cell, servos
         self.collisions: dict[str, Touch] = {}
         """The first touch of each two bodies that must not, since somebody last emptied it."""
@@ -76,7 +77,7 @@ class ServoFollower:
         fine = bool((state.gripper_mm < self._open_mm).any())
         if fine != self._fine:
             self._fine = fine
-            cell.engine.pace(FINE if fine else COARSE)
+            cell.engine.fine(fine)
         cell.engine.advance(SERVO_S)
         if self._steps % _LOOK_EVERY == 0:
             self._look(state)

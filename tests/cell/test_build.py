@@ -91,13 +91,13 @@ def test_every_command_that_reads_a_cell_refuses_it(command, tmp_path, monkeypat
 def test_hands_close_on_the_pin_wherever_a_block_is_carried(changes, name):
     """A cell alone may be looked at with any pick height; its reach is a matter of the arms."""
     from marl_handover.motion.planner import MotionPlanner
-    from marl_handover.simulation.world import BulletCell
+    from marl_handover.simulation.world import SimulatedCell
 
     model = build_cell(PAPER)
     pin = {"block": BlockConfig(pin_diameter_mm=20.0)} if not changes else {}
     other = model._replace(cell=replace(model.cell, config=replace(PAPER, **changes, **pin)))
     motion = MotionConfig(finger_travel_mm=9.0)
-    for made in (MotionPlanner, BulletCell):
+    for made in (MotionPlanner, SimulatedCell):
         with pytest.raises(InvalidSetting) as caught:
             made(other, motion)
         assert caught.value.name == name

@@ -15,7 +15,7 @@ from marl_handover.commands.simulate import ALIASES, GROUPS, SCHEMA, run
 from marl_handover.compose import compose
 from marl_handover.errors import HandoverError, MissingFile, WorkFailed
 from marl_handover.simulation import film
-from marl_handover.simulation.backend import BulletBackend
+from marl_handover.simulation.backend import PhysicsBackend
 
 
 def simulate(*arguments):
@@ -88,7 +88,7 @@ def test_an_error_is_one_line(argument, status, says):
 @pytest.fixture
 def said(monkeypatch):
     """What is said below each picture that is drawn, and where the block is then: pairs, in order."""
-    pairs, draw, render = [], film.captioned, BulletBackend.render
+    pairs, draw, render = [], film.captioned, PhysicsBackend.render
     poses = []
 
     def rendered(backend):
@@ -99,7 +99,7 @@ def said(monkeypatch):
         pairs.append((caption, poses[-1]))
         return draw(picture, caption, size)
 
-    monkeypatch.setattr(BulletBackend, "render", rendered)
+    monkeypatch.setattr(PhysicsBackend, "render", rendered)
     monkeypatch.setattr(film, "captioned", drawn)
     return pairs
 

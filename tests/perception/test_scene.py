@@ -1,4 +1,4 @@
-"""What the twin's camera shows of a PyBullet cell, and that boards are held where a camera can see them."""
+"""What the twin's camera shows of a simulated cell, and that boards are held where a camera can see them."""
 
 import numpy as np
 import pytest
@@ -8,13 +8,13 @@ from marl_handover.geometry.se3 import flat_pose
 from marl_handover.perception.detector import Detector
 from marl_handover.perception.printables import board_corners_mm
 from marl_handover.perception.scene import block_shapes, held_boards
-from marl_handover.simulation.world import BulletCell
+from marl_handover.simulation.world import SimulatedCell
 from tests.canonical_arms import PARKED_DEG
 
 
-def test_the_detector_sees_a_pybullet_cell_as_it_is(model, painter, calibration):
+def test_the_detector_sees_a_simulated_cell_as_it_is(model, engine, painter, calibration):
     detector = Detector(calibration, model.cell.config.block)
-    with BulletCell(model, MotionConfig()) as cell:
+    with SimulatedCell(model, MotionConfig(), engine=engine) as cell:
         for pose in ((-190.0, 110.0, 2.5), (60.0, -40.0, -1.0)):
             cell.reset(pose)
             image = painter.picture(cell.block.transform(), cell.joints_rad(), gripper_mm=[arm.gripper_mm() for arm in cell.arms])

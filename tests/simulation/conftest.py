@@ -7,7 +7,7 @@ import pytest
 
 from marl_handover.config import MotionConfig
 from marl_handover.motion.trajectory import Phase
-from marl_handover.simulation.world import BulletCell
+from marl_handover.simulation.world import SimulatedCell
 from tests.canonical_arms import PARKED_DEG
 
 ABOVE_MM = 40.0
@@ -20,8 +20,8 @@ def motion():
 
 
 @pytest.fixture
-def cell(model, motion):
-    with BulletCell(model, motion) as cell:
+def cell(model, motion, engine):
+    with SimulatedCell(model, motion, engine=engine) as cell:
         yield cell
 
 

@@ -5,18 +5,18 @@ import math
 import numpy as np
 import pytest
 
+from marl_handover.config import TaskConfig
 from marl_handover.envs.backends import make_backend
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.motion.planner import MotionPlanner
-from marl_handover.simulation.backend import BulletBackend
-from marl_handover.simulation.engine import length, pybullet
+from marl_handover.simulation.backend import PhysicsBackend
 from marl_handover.simulation.world import CONTROL_S
 from tests.canonical_arms import PARKED_DEG
 
 
 @pytest.fixture
-def backend(model, motion):
-    backend = BulletBackend(model, motion)
+def backend(model, motion, engine):
+    backend = make_backend(engine, model, TaskConfig(), motion)
     yield backend
     backend.close()
 
@@ -84,9 +84,7 @@ def test_a_cycle_that_is_nearly_joined_is_carried_out(backend, planner, motion):
 
 def lay_down(backend, pose, tilt_deg):
     """The block on its side, nothing else changed."""
-    turned = pybullet.getQuaternionFromEuler([math.radians(tilt_deg), 0.0, 0.0])
-    at = [length(value) for value in (*pose[:2], 20.0)]
-    pybullet.resetBasePositionAndOrientation(backend.cell.block.body, at, turned, physicsClientId=backend.cell.engine.client)
+    backend.cell.engine.put_block((pose[0], pose[1] + 10.0, 20.0), (math.radians(tilt_deg), 0.0, 0.0))
     backend.cell.settle()
 
 
@@ -106,11 +104,10 @@ def test_a_block_that_lies_has_tipped_whatever_else_went_wrong(backend, cycle, f
     assert done.refusal == Refusal.TIPPED
 
 
-def test_it_is_found_by_name(model, motion):
-    from marl_handover.config import TaskConfig
-
-    backend = make_backend("bullet", model, TaskConfig(), motion, grasp="constraint", size=(64, 36))
-    assert isinstance(backend, BulletBackend)
+def test_it_is_found_by_name(model, motion, engine):
+    backend = make_backend(engine, model, TaskConfig(), motion, grasp="constraint", size=(64, 36))
+    assert isinstance(backend, PhysicsBackend)
+    assert type(backend.cell.engine).__name__.lower() == f"{engine}engine"
     assert not backend.exact
     backend.reset(np.zeros(3), 3)
     assert backend.render().shape == (36, 64, 3)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from marl_handover.config import BlockConfig
-from marl_handover.simulation.world import _beads_mm, _mass_properties
+from marl_handover.simulation.block import beads_mm, mass_properties
 
 
 def test_mass_and_inertia_agree_with_a_sum_over_voxels():
@@ -14,7 +14,7 @@ def test_mass_and_inertia_agree_with_a_sum_over_voxels():
     solid = (z < 8) | (np.hypot(x, y) < 3)
     x, y, z = x[solid], y[solid], z[solid]
     piece = 650e-9 * 0.25**3
-    mass, centre, (across, _, along) = _mass_properties(config)
+    mass, centre, (across, _, along) = mass_properties(config)
     assert mass == pytest.approx(piece * len(x), rel=0.01)
     assert centre == pytest.approx(z.mean(), rel=0.01)
     assert across == pytest.approx(piece * (y**2 + (z - z.mean()) ** 2).sum(), rel=0.01)
@@ -23,6 +23,6 @@ def test_mass_and_inertia_agree_with_a_sum_over_voxels():
 
 def test_the_beads_stay_within_the_pin():
     config = BlockConfig()
-    beads = _beads_mm(config)
+    beads = beads_mm(config)
     assert beads.min() - config.pin_diameter_mm / 2 == pytest.approx(config.height_mm)
     assert beads.max() + config.pin_diameter_mm / 2 == pytest.approx(config.pin_top_mm)

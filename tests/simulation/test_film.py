@@ -5,15 +5,16 @@ import numpy as np
 import pytest
 
 from marl_handover.arrays import wrap
-from marl_handover.simulation.backend import BulletBackend
+from marl_handover.config import TaskConfig
+from marl_handover.envs.backends import make_backend
 from marl_handover.simulation.film import BEGIN_S, END_S, filming, picture_size
 
 SIZE, FPS = (160, 120), 10
 
 
 @pytest.fixture(scope="module")
-def backend(model, motion):
-    backend = BulletBackend(model, motion, grasp="constraint", size=picture_size(SIZE, True))
+def backend(model, motion, engine):
+    backend = make_backend(engine, model, TaskConfig(), motion, grasp="constraint", size=picture_size(SIZE, True))
     yield backend
     backend.close()
 

@@ -8,7 +8,7 @@ import pytest
 from marl_handover.config import MotionConfig
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.simulation.follower import ServoFollower, ServoState
-from marl_handover.simulation.world import BulletCell
+from marl_handover.simulation.world import SimulatedCell
 from tests.canonical_arms import PARKED_DEG
 
 START = np.array([20.0, 10.0, 0.4])
@@ -31,9 +31,9 @@ def played(model):
     return motion, servos, t_s[-1]
 
 
-def test_the_block_goes_where_the_cell_itself_would_take_it(model, played):
+def test_the_block_goes_where_the_cell_itself_would_take_it(model, played, engine):
     motion, servos, duration_s = played
-    with BulletCell(model, MotionConfig()) as cell:
+    with SimulatedCell(model, MotionConfig(), engine=engine) as cell:
         cell.reset(START)
         follower = ServoFollower(cell, servos)
         follower.advance(duration_s + 0.5)
@@ -48,10 +48,10 @@ def test_the_block_goes_where_the_cell_itself_would_take_it(model, played):
     assert np.abs(followed[:2] - END_MM).max() < 2.0
 
 
-def test_a_world_at_rest_is_not_computed_until_somebody_moves(model):
+def test_a_world_at_rest_is_not_computed_until_somebody_moves(model, engine):
     parked = np.tile(np.radians(PARKED_DEG), (2, 1))
     state = ServoState(parked, np.full(2, MotionConfig().finger_travel_mm))
-    with BulletCell(model, MotionConfig()) as cell:
+    with SimulatedCell(model, MotionConfig(), engine=engine) as cell:
         cell.reset(START)
         follower = ServoFollower(cell, lambda now_s: state)
         follower.advance(100.0)

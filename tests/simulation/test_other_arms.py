@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from marl_handover.cell.build import build_cell
-from marl_handover.config import MotionConfig, RobotConfig
+from marl_handover.config import BlockConfig, MotionConfig, RobotConfig, TaskConfig
+from marl_handover.envs.backends import make_backend
 from marl_handover.errors import UrdfError
 from marl_handover.geometry.robot import read_robot, robot_config
 from marl_handover.geometry.se2 import SE2
@@ -17,11 +18,10 @@ from marl_handover.geometry.urdf import Inertial
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.simulation.arm import SimulatedArm
 from marl_handover.simulation.arm_file import arm_file, is_canonical, whole, written
-from marl_handover.simulation.backend import BulletBackend
 from marl_handover.simulation.camera import TOP, view
 from marl_handover.simulation.effort import holding_n_m, require_effort
-from marl_handover.simulation.engine import Engine
-from marl_handover.simulation.world import BulletCell
+from marl_handover.simulation.engine import Scene, open_engine
+from marl_handover.simulation.world import SimulatedCell
 from tests.canonical_arms import MEDIUM, SO101, WX250
 
 
@@ -57,17 +57,18 @@ def test_a_written_file_says_what_the_description_does(tmp_path, lengths):
 
 
 @pytest.mark.parametrize("robot", ["al5a_paper", "so101", "px100"])
-def test_an_arm_in_physics_stands_where_its_kinematics_say(robot):
-    arm, engine = read_robot(robot_config(robot)), Engine()
-    engine.clear()
-    body = SimulatedArm(engine, arm, SE2(120.0, -80.0, (0.6, 0.8)))
-    random, base = np.random.default_rng(2), SE2(120.0, -80.0, (0.6, 0.8)).matrix()
+def test_an_arm_in_physics_stands_where_its_kinematics_say(robot, engine):
+    arm, at = read_robot(robot_config(robot)), SE2(120.0, -80.0, (0.6, 0.8))
+    world = open_engine(engine, Scene([arm], [at], BlockConfig(), [False]))
+    world.reset()
+    body = SimulatedArm(world, 0, arm)
+    random, base = np.random.default_rng(2), at.matrix()
     for q in random.uniform(arm.lower_rad, arm.upper_rad, (20, 5)):
         body.place(q, 5.0)
         np.testing.assert_allclose(body.grip_mm(), (base @ arm.fk(q))[:3, 3], atol=0.02)
         np.testing.assert_allclose(body.joints_rad(), q, atol=1e-9)
         assert body.gripper_mm() == pytest.approx(5.0, abs=1e-6)
-    engine.close()
+    world.close()
 
 
 def test_masses_that_are_not_said_are_made_up_and_told(tmp_path):
@@ -88,10 +89,10 @@ def tensor(inertial):
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def carried_out(model, count, seed=3):
+def carried_out(model, engine, count, seed=3):
     """Position [mm] and orientation [deg] errors (n,) of transfers that were carried out, and what failed."""
     planner, random, errors, failures = MotionPlanner(model), np.random.default_rng(seed), [], []
-    backend = BulletBackend(model, planner.motion)
+    backend = make_backend(engine, model, TaskConfig(), planner.motion)
     try:
         for _ in range(count):
             arm = int(random.integers(2))
@@ -110,8 +111,8 @@ def carried_out(model, count, seed=3):
 
 
 @pytest.mark.parametrize(("lengths", "sticks"), [(MEDIUM, False), (SO101, False), (BARE, True)], ids=["medium", "down", "no fingers"])
-def test_other_arms_put_the_block_where_they_are_told(tmp_path, lengths, sticks):
-    away_mm, turned_deg, failures, notes = carried_out(build_cell(lengths.cell(tmp_path, grid_mm=10.0)), 4)
+def test_other_arms_put_the_block_where_they_are_told(tmp_path, engine, lengths, sticks):
+    away_mm, turned_deg, failures, notes = carried_out(build_cell(lengths.cell(tmp_path, grid_mm=10.0)), engine, 4)
     assert not failures
     assert away_mm.max() < 2.0
     assert np.median(turned_deg) < 0.3
@@ -119,14 +120,14 @@ def test_other_arms_put_the_block_where_they_are_told(tmp_path, lengths, sticks)
     assert any("sticks to its hand" in note for note in notes) == sticks
 
 
-def test_a_block_that_hangs_low_below_two_pads_is_held_by_a_rigid_joint_unless_friction_is_asked_for(tmp_path):
+def test_a_block_that_hangs_low_below_two_pads_is_held_by_a_rigid_joint_unless_friction_is_asked_for(tmp_path, engine):
     model = build_cell(MEDIUM.cell(tmp_path, grid_mm=10.0, pick_height_mm=60.0))
-    away_mm, turned_deg, failures, notes = carried_out(model, 3)
+    away_mm, turned_deg, failures, notes = carried_out(model, engine, 3)
     assert not failures
     assert away_mm.max() < 0.2
     assert turned_deg.max() < 0.1
     assert "rigid joint" in notes[0]
-    with BulletCell(model, MotionConfig(), grasp="friction") as cell:
+    with SimulatedCell(model, MotionConfig(), engine=engine, grasp="friction") as cell:
         assert not cell.notes
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from marl_handover.errors import UnknownChoice
 from marl_handover.simulation.engine import NoWindow
-from marl_handover.simulation.world import BulletCell
+from marl_handover.simulation.world import SimulatedCell
 from tests.canonical_arms import PARKED_DEG
 
 CASES = [
@@ -37,9 +37,9 @@ def test_a_friction_grasp_puts_the_block_where_the_closed_form_says(cell, cycle,
     np.testing.assert_allclose(cell.joints_rad(), np.tile(np.radians(PARKED_DEG), (2, 1)), atol=math.radians(0.2))
 
 
-def test_a_constraint_grasp_is_nearly_exact(model, motion, cycle, expected):
+def test_a_constraint_grasp_is_nearly_exact(model, motion, engine, cycle, expected):
     arm, pose, place = CASES[0]
-    with BulletCell(model, motion, grasp="constraint") as cell:
+    with SimulatedCell(model, motion, engine=engine, grasp="constraint") as cell:
         cell.reset(pose)
         cell.run(arm, cycle(arm, pose[:2], place))
         position_mm, yaw_deg = off(cell.object_pose(), expected(arm, pose, place))
@@ -47,10 +47,10 @@ def test_a_constraint_grasp_is_nearly_exact(model, motion, cycle, expected):
     assert yaw_deg < 0.1
 
 
-def test_equal_calls_give_bit_identical_states_whatever_went_before_and_beside(model, motion, cycle):
+def test_equal_calls_give_bit_identical_states_whatever_went_before_and_beside(model, motion, engine, cycle):
     arm, pose, place = CASES[0]
     phases = cycle(arm, pose[:2], place)
-    with BulletCell(model, motion) as first, BulletCell(model, motion) as second:
+    with SimulatedCell(model, motion, engine=engine) as first, SimulatedCell(model, motion, engine=engine) as second:
         second.reset((0.0, 10.0, 1.0))
         second.run(1, cycle(1, (0.0, 10.0), (40.0, 0.0))[:2])
         states = []
@@ -124,9 +124,9 @@ def test_servos_follow_within_their_speed(cell, model, cycle):
     assert np.abs(seen - wanted).max() < math.radians(1.5)
 
 
-def test_bad_settings_are_refused(model, motion, monkeypatch):
+def test_bad_settings_are_refused(model, motion, engine, monkeypatch):
     with pytest.raises(UnknownChoice, match="glue"):
-        BulletCell(model, motion, grasp="glue")
+        SimulatedCell(model, motion, engine=engine, grasp="glue")
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(NoWindow, match="display"):
-        BulletCell(model, motion, gui=True)
+        SimulatedCell(model, motion, engine=engine, gui=True)
