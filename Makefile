@@ -23,7 +23,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 help:
 	@echo "make demo       install, train a supervisor, evaluate it against the exact planner, leave pictures in runs/"
 	@echo "make test       install and run the tests; make test-slow the slow ones (wheel, SIGKILL, longer learners)"
-	@echo "make test-pythons the tests with Python 3.11, 3.12 and 3.13, as far as they are here"
+	@echo "make test-pythons the tests with every other Python that fits and is here; TESTS=tests/cell names some of them"
 	@echo "make fuzz       20,000 random command lines over every key of every command, in one process (an hour or two)"
 	@echo "make test-lowest the tests with the lowest versions that pyproject.toml allows, in .venv-lowest"
 	@echo "make check      style, types and import layers; make format repairs the style"
@@ -50,10 +50,10 @@ demo: $(STAMP)
 	@echo "The run, its evaluation and the pictures are in runs/demo"
 
 test: $(STAMP)
-	$(ONE_THREAD) $(BIN)/python $(PYTEST)
+	$(ONE_THREAD) $(BIN)/python $(PYTEST) $(TESTS)
 
-# In .venv first, then with every other Python that is here, each in an environment of its own.
-test-pythons: test
+# Each in an environment of its own beside .venv, whose Python is left to "make test".
+test-pythons: $(STAMP)
 	$(foreach v,$(filter-out $(shell $(BIN)/python -c "$(VERSION)"),$(VERSIONS)),$(call test_with,$(v),$(call first_suitable,python$(v) $(call kept,$(v)))))
 
 define test_with

@@ -60,6 +60,44 @@ def test_every_requirement_is_pinned_within_its_range():
         assert pin.version in line.specifier, line
 
 
+WITHOUT_ENGINES = {
+    "evaluate backend=bullet policy=exact episodes=1": "bullet",
+    "evaluate backend=mujoco policy=exact episodes=1": "mujoco",
+    "simulate policy=exact engine=bullet": "bullet",
+    "simulate policy=exact": "mujoco",
+    "calibrate hardware=twin what=camera calibration=found": "mujoco",
+    "doctor": None,
+    "plan start=[-100,50,10] goal=[80,-40,120] motion=motion.json": None,
+    "evaluate policy=pretrained_b backend=noisy episodes=2 progress=false": None,
+}
+"""Command lines, and the engine that each lacks where none is installed."""
+RUN_THEM = f"""
+import sys
+sys.modules.update(pybullet=None, mujoco=None)
+from marl_handover.cli import main
+for line in {list(WITHOUT_ENGINES)!r}:
+    print("STATUS", main(line.split()), file=sys.stderr)
+"""
+
+
+def test_what_needs_an_engine_that_is_not_installed_gives_one_line_that_installs_it_and_the_rest_works(tmp_path):
+    """In a process in which the engines' packages cannot be imported."""
+    done = subprocess.run([sys.executable, "-c", RUN_THEM], capture_output=True, text=True, cwd=tmp_path, timeout=280)
+    said = re.split(r"^STATUS (\d)\n", done.stderr, flags=re.M)
+    assert len(said) == 2 * len(WITHOUT_ENGINES) + 1, done.stderr
+    for (line, lacked), told, status in zip(WITHOUT_ENGINES.items(), said[::2], said[1::2], strict=False):
+        if lacked is None:
+            assert status == "0", told
+            continue
+        (needed,) = PROJECT["optional-dependencies"][lacked]
+        package = Requirement(needed).name
+        assert status == "2", line
+        assert told.splitlines()[-1] == (
+            f"marl-handover {line.split()[0]}: the physics engine {lacked} needs the package {package}; run: pip install '{needed}'"
+        )
+        assert "Traceback" not in told
+
+
 def make(python: str, tmp_path: Path) -> subprocess.CompletedProcess[str]:
     """What ``make`` says to an interpreter; nothing is installed if it does not fit."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}

@@ -37,6 +37,7 @@ def run(config: DoctorConfig) -> int:
     sections = {
         "system": _system(),
         "packages": _packages(core),
+        "physics engines": _engines(),
         "devices": _devices(),
         "compiler": _compiler(),
         "cameras": _listed("/dev", "video*", "none found"),
@@ -64,6 +65,26 @@ def _installed(package: str) -> str | None:
 def _packages(packages: tuple[str, ...]) -> Iterator[str]:
     for package in packages:
         yield f"{package:<27} {_installed(package) or 'MISSING'}"
+
+
+def _engines() -> Iterator[str]:
+    """Which physics engines are here, which one is taken where none is named, and the line that installs another."""
+    try:
+        from marl_handover.config import ENGINES
+        from marl_handover.simulation.engine import default_engine
+    except ImportError as error:
+        yield f"cannot be listed: {error}"
+        return
+    used, extras = default_engine(), requirements()
+    for engine in filter(extras.get, ENGINES):  # a plugin's has no extra
+        package = name_of(extras[engine][0])
+        if found := _installed(package):
+            yield f"{engine:<14} {package} {found}{', in use where none is named' if engine == used else ''}"
+        else:
+            yield f"{engine:<14} not installed; run: {install_line(engine)}{_FROM_SOURCE if package == 'pybullet' else ''}"
+
+
+_FROM_SOURCE = "" if sys.version_info < (3, 12) else " (no wheel for this Python: built from source, which needs g++ and some ten minutes)"
 
 
 def _system() -> Iterator[str]:

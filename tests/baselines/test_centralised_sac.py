@@ -17,6 +17,7 @@ from marl_handover.learning.trainer import Trainer
 from marl_handover.learning.variant import make_variant
 from marl_handover.motion.batched_paths import mirrored_numbers
 from marl_handover.policies import SupervisorPolicy
+from marl_handover.simulation.engine import default_engine
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Rules
 from tests.symmetries import GROUP, flips_x
@@ -176,8 +177,9 @@ def test_a_run_is_evaluated_with_its_motions(trained):
     assert again.report["success_rate"] >= done.report["success_rate"]
 
 
-@pytest.mark.parametrize("backend", ["noisy", "bullet"])
+@pytest.mark.parametrize("backend", ["noisy", "physics"])
 def test_executors_do_not_make_its_motions(trained, backend):
+    backend = default_engine() if backend == "physics" else backend
     with pytest.raises(InvalidSetting, match="kinematic"):
         assess(AssessmentConfig(policy=str(trained.folder), episodes=1, backend=backend), progress=False)
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+import sys
 import threading
 import tomllib
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
@@ -13,12 +16,14 @@ from packaging.requirements import Requirement
 
 from marl_handover.cli import main
 from marl_handover.commands import doctor
+from marl_handover.config import ENGINES
 from marl_handover.errors import CORE, applies, by_extra, name_of, requirements
 from marl_handover.hardware import session_registry, settings, transport
 from marl_handover.hardware.emulator.board import EmulatedBoard
 from marl_handover.hardware.emulator.device import EmulatedDevice
 from marl_handover.hardware.emulator.pty import PtyEmulator
 from marl_handover.hardware.estop import StopLatch
+from marl_handover.simulation import engine
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
@@ -64,6 +69,41 @@ def test_packages_of_an_extra_that_are_missing_are_named_with_the_line_that_inst
     doctor.run(doctor.DoctorConfig())
     assert "[more]" in (out := capsys.readouterr().out)
     assert "missing no-such-package; run: the line for more" in out
+
+
+def _told_engines(capsys) -> dict[str, str]:
+    doctor.run(doctor.DoctorConfig())
+    lines = capsys.readouterr().out.partition("physics engines\n")[2].splitlines()
+    return {
+        line.split()[0]: line.partition(line.split()[0])[2].strip()
+        for line in itertools.takewhile(lambda line: line.startswith("  "), lines)
+    }
+
+
+@pytest.mark.parametrize(("here", "used"), [({"pybullet", "mujoco"}, "bullet"), ({"pybullet"}, "bullet"), ({"mujoco"}, "mujoco")])
+def test_the_engine_in_use_is_named_and_the_line_that_installs_the_other(here, used, monkeypatch, capsys):
+    packages = {"bullet": "pybullet", "mujoco": "mujoco"}
+    monkeypatch.setattr(doctor, "version", lambda package: "1.2.3" if package in here else _missing(package))
+    monkeypatch.setattr(engine, "default_engine", lambda: used)
+    told = _told_engines(capsys)
+    assert list(told) == ["bullet", "mujoco"]
+    for name, said in told.items():
+        if packages[name] not in here:
+            assert said.startswith(f"not installed; run: pip install '{EXTRAS[name][0]}'")
+            assert ("built from source" in said) == (name == "bullet" and sys.version_info >= (3, 12))
+        else:
+            assert said == f"{packages[name]} 1.2.3" + (", in use where none is named" if name == used else "")
+
+
+def _missing(package):
+    raise PackageNotFoundError(package)
+
+
+def test_what_is_in_use_is_what_opens(capsys):
+    told = _told_engines(capsys)
+    (used,) = [name for name, said in told.items() if "in use" in said]
+    assert used == engine.default_engine()
+    assert used in ENGINES
 
 
 @pytest.fixture

@@ -320,9 +320,9 @@ def test_the_closed_loop_is_repeatable(tmp_path):
     assert told() != told("seed=1")
 
 
-def test_a_few_problems_in_the_simulated_cell(tmp_path):
+def test_a_few_problems_in_the_simulated_cell(tmp_path, engine):
     (tmp_path / "problems.jsonl").write_text("\n".join(problem_lines(1)))
-    result, lines = evaluated(tmp_path, "backend=bullet", "grasp=constraint", f"problems={tmp_path / 'problems.jsonl'}")
+    result, lines = evaluated(tmp_path, f"backend={engine}", "grasp=constraint", f"problems={tmp_path / 'problems.jsonl'}")
     assert set(result) == FIELDS | LOOP_FIELDS | {"symmetry_order", "grasp"}
     assert result["success_rate"] == result["success_in_the_end"] == 1.0
     assert result["transfer_error_mm"]["p95"] <= 2.0

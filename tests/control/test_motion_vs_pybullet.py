@@ -11,12 +11,13 @@ import math
 import xml.etree.ElementTree as ET
 
 import numpy as np
-import pybullet
 import pytest
 
 from marl_handover.cell import cell_config, load_cell
 from marl_handover.cli import main
 from marl_handover.geometry.robot import robot_config
+
+pybullet = pytest.importorskip("pybullet")
 
 JOINTS = ("base_yaw", "shoulder", "elbow", "wrist_pitch", "wrist_roll")
 PHASES = ("approach", "grasp", "lift", "transfer", "lower", "release", "retreat")

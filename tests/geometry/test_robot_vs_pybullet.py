@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pybullet
 import pytest
 from cases import PUBLIC, RINGS_MM, SMALL
 
@@ -18,6 +17,8 @@ from marl_handover.files import resource_path
 from marl_handover.geometry.closed_form import ClosedFormArm
 from marl_handover.geometry.robot import describe, robot_config
 from marl_handover.geometry.se3 import transform
+
+pybullet = pytest.importorskip("pybullet")
 
 FEW, MANY = 200, 10_000
 TOLERANCE_MM, TOLERANCE_DEG = 0.01, 0.01

@@ -257,11 +257,11 @@ def test_noisy_arms_are_judged_by_what_is_measured(begin):
         assert 1.0 < float(missed[rows_of].mean()) < 4.0
 
 
-def test_noisy_arms_are_watched_with_their_noise(begin):
+def test_noisy_arms_are_watched_with_their_noise(begin, engine):
     """The backend's own if the task has none; physics has none that is known."""
     experience, _ = begin("backend=noisy")
     assert experience.env.rules.config.noise == NoiseConfig(position_mm=1.0, yaw_deg=0.5)
-    assert not begin("backend=bullet", "executor=optimised")[0].env.rules.noisy
+    assert not begin(f"backend={engine}", "executor=optimised")[0].env.rules.noisy
 
 
 def only_finishing(learner):
@@ -370,9 +370,9 @@ def test_ray_actors_do_as_they_are_told_and_their_loss_is_named(begin):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("collector", ["local", "multiprocess"])
-def test_bullet_brings_rows(collector, begin):
+def test_physics_brings_rows(collector, begin, engine):
     """Planned paths of arms with a friction grasp; most transfers within reach come out within millimetres."""
-    experience, learner = begin("backend=bullet", "executor=optimised", f"collector={collector}", "num_envs=6")
+    experience, learner = begin(f"backend={engine}", "executor=optimised", f"collector={collector}", "num_envs=6")
 
     def explore(observation):
         return learner.random_action(observation)
