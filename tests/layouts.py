@@ -10,6 +10,21 @@ import numpy as np
 from marl_handover.cell import build_cell
 from marl_handover.config import ArmConfig, CellConfig
 
+SHIPPED = {"triangle": 3, "line4": 4, "ring6": 6}
+"""Cells of many arms that travel with the package."""
+
+BLOCKED = """name: blocked
+robot: al5a_paper
+arms:
+  - {name: west, x_mm: -180.0, facing_deg: 0.0}
+  - {name: east, x_mm: 180.0, facing_deg: 180.0}
+  - {name: a rather long name, y_mm: 310.0, facing_deg: -90.0}
+obstacles:
+  - {x_mm: 0.0, y_mm: -60.0, radius_mm: 15.0}
+  - {x_mm: -100.0, y_mm: 190.0, radius_mm: 12.0, height_mm: 80.0}
+"""
+"""A cell with obstacles, as a file of settings."""
+
 
 def ring(count, side_mm=360.0):
     """Arms on a regular polygon, each facing its middle; two of them are a mirrored pair."""

@@ -157,7 +157,8 @@ def _planner(config: PlanConfig, policy: SupervisorPolicy) -> MotionPlanner | No
     try:
         return MotionPlanner(build_cell(policy.rules.cell.config), config.arm_motion)
     except InvalidSetting as error:
-        raise InvalidSetting(f"arm_{error.name}", error.value, error.limit) from error
+        key = f"arm_{error.name}" if error.name.startswith("motion.") else error.name
+        raise InvalidSetting(key, error.value, error.limit) from error
     except UnknownChoice as error:
         raise UnknownChoice(f"arm_{error.name}", error.value, error.choices) from error
 

@@ -114,6 +114,8 @@ def _text(summary: dict[str, Any]) -> str:
     if summary["base_distance_mm"] is not None:
         rows.append(("base distance", f"{summary['base_distance_mm']:g} mm"))
     rows.append(("shared space", f"{_space(summary)}, chart inset {summary['chart_inset']:g}"))
+    if summary["obstacles"]:
+        rows.append(("obstacles", f"{len(summary['obstacles'])}, taken out of what the arms reach and share, not out of the grid"))
     rows.append(("grid points", ", ".join(f"{name} {count}" for name, count in points.items()) + f", every {summary['grid_mm']:g} mm"))
     return "\n".join(f"{name:<14} {value}" for name, value in rows)
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from marl_handover.cell import CellModel
 from marl_handover.cell.cell import Cell
@@ -31,23 +32,27 @@ from marl_handover.report.table import (
 
 
 def workspace_figure(model: CellModel) -> Figure:
-    """Grid points of each arm alone and of both, annulus sectors with their yaw limits, chart, bases."""
+    """Grid points of each arm alone and of several, annulus sectors with their yaw limits, a pair's chart, obstacles, bases."""
     cell, grid = model.cell, model.grid
-    figure = Figure(figsize=(7.6, 6.4), layout="constrained")
+    columns = 4 if cell.num_arms == 2 else 3
+    figure = Figure(figsize=(WORKSPACE_INCHES, _workspace_height(cell, columns)), layout="constrained")
     axes = figure.add_subplot()
+    dot = _dot(cell)
     points = np.stack(np.meshgrid(grid.x_mm, grid.y_mm, indexing="ij"), -1)
     reached = grid.masks.sum(0)
     for arm, mask in enumerate(grid.masks):
         alone = points[mask & (reached == 1)]
         label = f"grid: {cell.labels[arm]} alone, {len(alone)}"
-        axes.scatter(alone[:, 0], alone[:, 1], s=2.5, color=arm_colour(arm), linewidths=0, label=label, rasterized=True)
+        axes.scatter(alone[:, 0], alone[:, 1], s=2.5 * dot, color=arm_colour(arm), linewidths=0, label=label, rasterized=True)
     both = points[reached > 1]
     who = "both" if cell.num_arms == 2 else "two or more"
-    axes.scatter(both[:, 0], both[:, 1], s=4.5, color=SHARED, linewidths=0, label=f"grid: {who}, {len(both)}", rasterized=True)
+    axes.scatter(both[:, 0], both[:, 1], s=4.5 * dot, color=SHARED, linewidths=0, label=f"grid: {who}, {len(both)}", rasterized=True)
     draw_circles(axes, cell)
     draw_sectors(axes, cell, strength=0.06, labelled=True)
     if cell.num_arms == 2:
         draw_chart(axes, cell)
+    else:
+        draw_shared(axes, cell, strength=0.25)
     draw_obstacles(axes, cell, labelled=True)
     draw_bases(axes, cell)
     frame_table(axes, cell)
@@ -57,13 +62,34 @@ def workspace_figure(model: CellModel) -> Figure:
         f"cell {cell.config.name}: {_rings(cell)}{_apart(cell)}, grid {cell.config.grid_mm:g} mm",
         fontsize=10,
     )
-    figure.legend(loc="outside lower center", ncols=4, fontsize=8, markerscale=3, frameon=False)
+    figure.legend(loc="outside lower center", ncols=columns, fontsize=8, markerscale=3 / math.sqrt(dot), frameon=False)
     return figure
 
 
+WORKSPACE_INCHES = 7.6
+
+
+def _workspace_height(cell: Cell, columns: int) -> float:
+    """Height in inches of the figure of a cell, which is wide enough for a pair's chart and legend, or for what many arms need."""
+    if cell.num_arms == 2:
+        return 6.4
+    entries = 2 * cell.num_arms + 2 + (2 if cell.config.obstacles else 0)
+    return (WORKSPACE_INCHES - 1.0) * _aspect(cell) + 1.0 + 0.2 * math.ceil(entries / columns)
+
+
+def _dot(cell: Cell) -> float:
+    """Area of a grid point, as a part of a pair's: in large cells points of that size would run into each other."""
+    if cell.num_arms == 2:
+        return 1.0
+    points_a_step = 72 * (WORKSPACE_INCHES - 1.0) * cell.config.grid_mm / (2 * cell.extent_mm[0])
+    return float(np.clip(points_a_step / 4.5, 0.25, 1.0)) ** 2
+
+
 def _rings(cell: Cell) -> str:
-    rings = [f"{arm.r_min_mm:g} to {arm.r_max_mm:g} mm" for arm in cell.arms]
-    return f"annulus {rings[0]}" if len(set(rings)) == 1 else f"annuli {', '.join(rings)}"
+    rings = list(dict.fromkeys(f"{arm.r_min_mm:g} to {arm.r_max_mm:g} mm" for arm in cell.arms))
+    if len(rings) > 2:
+        return f"annuli within {min(arm.r_min_mm for arm in cell.arms):g} to {max(arm.r_max_mm for arm in cell.arms):g} mm"
+    return f"annulus {rings[0]}" if len(rings) == 1 else f"annuli {', '.join(rings)}"
 
 
 def _apart(cell: Cell) -> str:
@@ -72,6 +98,8 @@ def _apart(cell: Cell) -> str:
 
 PANEL_INCHES, LEGEND_INCHES = 2.9, 7.5
 COLUMNS = 4
+WIDE = 0.5
+"""Panels of a table with less height for its width than this are twice as wide."""
 
 
 def check_plan(plan: Mapping[str, Any], path: Path) -> None:
@@ -96,11 +124,13 @@ def check_plan(plan: Mapping[str, Any], path: Path) -> None:
 def plan_figure(plan: Mapping[str, Any], cell: Cell) -> Figure:
     """A strip of panels: the block before (outline) and after (filled) each transfer, the acting arm's rays, the goal (dashed)."""
     transfers: Sequence[Mapping[str, Any]] = plan["transfers"]
-    columns = min(len(transfers), COLUMNS)
+    wide = 2 if _aspect(cell) < WIDE else 1
+    columns = min(len(transfers), COLUMNS // wide)
     rows = math.ceil(len(transfers) / columns)
-    entries = _legend()
-    across = len(entries) if PANEL_INCHES * columns > LEGEND_INCHES else 3
-    size = (max(PANEL_INCHES * columns, 5.2), _panel_height(cell) * rows + (0.55 if across > 3 else 0.75))
+    entries = _legend(cell)
+    inches = PANEL_INCHES * wide
+    across = len(entries) if inches * columns > LEGEND_INCHES else 3
+    size = (max(inches * columns, 5.2), (inches * _aspect(cell) + 0.35) * rows + 0.35 + 0.2 * math.ceil(len(entries) / across))
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False).reshape(-1)
     for index, (axes, transfer) in enumerate(zip(grid, transfers, strict=False)):
@@ -114,13 +144,12 @@ def plan_figure(plan: Mapping[str, Any], cell: Cell) -> Figure:
     return figure
 
 
-def _panel_height(cell: Cell) -> float:
-    """Height in inches of one panel that is PANEL_INCHES wide, its caption included."""
-    figure = Figure()
-    axes = figure.add_subplot()
+def _aspect(cell: Cell) -> float:
+    """Height of the framed table over its width."""
+    axes = Figure().add_subplot()
     frame_table(axes, cell)
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    return PANEL_INCHES * (high - low) / (right - left) + 0.35
+    return float((high - low) / (right - left))
 
 
 def _draw_transfer(axes: Axes, cell: Cell, transfer: Mapping[str, Any], goal: Sequence[float]) -> None:
@@ -158,12 +187,17 @@ def _headline(plan: Mapping[str, Any]) -> str:
     return f"policy {plan['policy']}: {outcome}, {counted(count, 'transfer')}{compared}"
 
 
-def _legend() -> list[Line2D]:
+def _legend(cell: Cell) -> list[Line2D | Patch]:
     block: dict[str, Any] = {"marker": "s", "linestyle": "none", "markersize": 9}
-    return [
+    entries: list[Line2D | Patch] = [
         Line2D([], [], markerfacecolor="none", markeredgecolor=GREY, label="block before", **block),
         Line2D([], [], markerfacecolor=FAINT, markeredgecolor=INK, label="block after", **block),
         Line2D([], [], color=GOAL, linestyle="--", label="goal"),
         Line2D([], [], color=INK, linestyle=":", label="arm at pick-up"),
         Line2D([], [], color=INK, linestyle="-", label="arm at drop-off"),
     ]
+    if cell.num_arms != 2:
+        entries.append(Patch(facecolor=SHARED, alpha=0.45, label="shared"))
+    if cell.config.obstacles:
+        entries.append(Patch(facecolor=GREY, edgecolor=INK, hatch="///", label="obstacle"))
+    return entries
