@@ -65,12 +65,17 @@ class AngleSums:
 
     def _within(self, sums, needed, reach_rad):
         """Whether a sum lies within ``reach_rad`` of what is needed, (n, N, N), first arm by last arm."""
-        count = np.concatenate([np.zeros((*sums.shape[:2], 1), int), np.cumsum(np.concatenate([sums] * 3, -1), -1)], -1)
-        middle = np.remainder(needed, 2 * math.pi) / self.width_rad + self.bins
+        middle = np.remainder(needed, 2 * math.pi) / self.width_rad
         low = np.ceil(middle - reach_rad / self.width_rad).astype(int)
         high = np.floor(middle + reach_rad / self.width_rad).astype(int)
+        below = np.zeros((*sums.shape[:2], self.bins + 1), np.int32)
+        np.cumsum(sums, -1, out=below[..., 1:])
         rows, columns = np.arange(len(sums))[:, None], np.arange(len(sums))[None, :]
-        return count[rows, columns, np.maximum(high + 1, low)] > count[rows, columns, low]
+
+        def number_below(index):
+            return below[rows, columns, index % self.bins] + (index // self.bins) * below[..., -1]
+
+        return number_below(np.maximum(high + 1, low)) > number_below(low)
 
 
 def moved(layout, pose, arm, place):

@@ -84,8 +84,9 @@ class Layout:
 
     def hand_over_angle(self, place, i, j):
         """psi_i - psi_j in [0, 2 pi)."""
-        psi = self.psi(place)
-        return np.remainder(psi[..., i] - psi[..., j], 2 * math.pi)
+        away = np.asarray(place, float)[..., None, :2] - self.bases[[i, j]]
+        psi = np.arctan2(away[..., 1], away[..., 0])
+        return np.remainder(psi[..., 0] - psi[..., 1], 2 * math.pi)
 
     def circles(self, i, j):
         """Circles (x, y, radius) that may bound what arms i and j share."""
@@ -138,7 +139,7 @@ class Layout:
             )
         return curves
 
-    def sampled_angles(self, i, j, step_rad, slack_mm=1e-9, points=1500):
+    def sampled_angles(self, i, j, step_rad, slack_mm=1e-9, points=800):
         """Hand-over angles of places on the edge of what arms i and j share, no further apart than ``step_rad`` along it; maybe none.
 
         A curve of equal angle ends at the bases, which neither arm reaches: so every angle that is offered is offered on the edge.
@@ -151,9 +152,10 @@ class Layout:
             t = np.linspace(0, 1, points)
             place = curve(t)
             near = self.margin(place, (i, j)).min(-1) > -2 * np.hypot(*np.diff(place[:2], axis=0)[0])
-            steps = np.abs(wrapped(np.diff(self.hand_over_angle(place, i, j))))
-            extra = np.where(near[:-1] | near[1:], np.ceil(steps / step_rad).astype(int), 1)
-            start = np.repeat(t[:-1], extra)
+            near = np.flatnonzero(near[:-1] | near[1:])
+            steps = np.abs(wrapped(self.hand_over_angle(place[near + 1], i, j) - self.hand_over_angle(place[near], i, j)))
+            extra = np.ceil(steps / step_rad).astype(int) + 1
+            start = np.repeat(t[near], extra)
             rank = np.arange(extra.sum()) - np.repeat(np.cumsum(extra) - extra, extra)
             finer = start + rank / np.repeat(extra, extra) * (t[1] - t[0])
             angles.append(self._angles_of(curve(finer), i, j, slack_mm))
