@@ -4,7 +4,7 @@ python bench/twin.py episodes=200 drills=200 soak=5000 robots=10 jobs=2 seed=0 n
 
 The episodes are spread over ``robots``: each has servos, camera, glue and paper of its own, drawn from ``seed``, and is calibrated by
 itself. ``noise`` multiplies everything that is drawn: dead bands, resting noise, scales, zeros, the cards' glue, the boards' laying, the
-camera's noise and blur. ``soak`` is a number of transfers of robot 0, in episodes one after the other.
+camera's noise and blur. ``engine`` is the physics, bullet or mujoco. ``soak`` is a number of transfers of robot 0, in episodes in a row.
 
 What is finished is in ``folder``, and is not done again: the same command goes on where it was killed. Other settings want another folder.
 """
@@ -37,11 +37,12 @@ DEFAULTS = {
     "seed": 0,
     "noise": 1.0,
     "policy": "pretrained_twin",
+    "engine": "bullet",
     "folder": "runs/bench_twin",
     "results": "bench/results",
 }
 BARS = {"first_time": 0.95, "in_the_end": 0.98, "drills": 0.95, "latency_ms": 150.0}
-_SAME = ("episodes", "drills", "soak", "robots", "seed", "noise", "policy")
+_SAME = ("episodes", "drills", "soak", "robots", "seed", "noise", "policy", "engine")
 
 
 def claim(root: Path, values: dict[str, Any]) -> None:
@@ -215,7 +216,8 @@ def main(arguments: list[str]) -> None:
     target = ROOT / values["results"] / datetime.date.today().isoformat()
     target.mkdir(parents=True, exist_ok=True)
     about = {"settings": values, "commit": commit(), "machine": machine(values["jobs"]), "started": rows(root / "started.jsonl")}
-    name = "twin.json" if float(values["noise"]) == 1.0 else f"twin_noise{values['noise']:g}.json"
+    other = {"noise": f"noise{values['noise']:g}", "engine": values["engine"]}
+    name = "_".join(["twin", *(word for key, word in other.items() if values[key] != DEFAULTS[key])]) + ".json"
     (target / name).write_text(json.dumps({**about, "wall_s": time.perf_counter() - begun, "bars": BARS, **found}, indent=1) + "\n")
     print(f"-> {target / name}")
 

@@ -91,7 +91,7 @@ def changed(changes: dict[str, Any]) -> WorkcellConfig:
 def calibrated(folder: Path, values: dict[str, Any], robot: int) -> WorkcellConfig:
     """The robot's settings, once `calibrate` has been run on it; its files are kept."""
     changes, kept = robot_changes(int(values["seed"]), robot, float(values["noise"])), folder / "calibration"
-    changes["hardware.stop_file"] = str(folder / "stop")
+    changes["hardware.stop_file"], changes["twin.engine"] = str(folder / "stop"), values["engine"]
     config = changed(changes)
     config.calibration = str(kept)
     if not is_calibrated(kept):

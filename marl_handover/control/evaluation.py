@@ -33,6 +33,7 @@ from marl_handover.config import (
     seed_field,
 )
 from marl_handover.envs.centralised import CentralisedRules, MotionCommand
+from marl_handover.envs.cycle_check import Refusal
 from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.learning.evaluation import (
@@ -56,6 +57,10 @@ from marl_handover.task.rules import Outcome, Rules
 if TYPE_CHECKING:
     from marl_handover.control.closed_loop import ClosedLoop
     from marl_handover.control.transfers import Episode, Transfer
+
+
+CONTACT = frozenset({Refusal.MISSED_GRASP, Refusal.DROPPED, Refusal.TIPPED, Refusal.COLLISION})
+"""What went wrong where bodies touch."""
 
 
 @dataclass
@@ -261,7 +266,8 @@ def loop_report(episodes: Sequence[Episode], rules: Rules) -> dict[str, Any]:
     Poses are the true ones where the backend knows them. ``position_error_mm`` and ``orientation_error_deg`` are of the first final
     placements that were carried out; ``transfer_error_mm`` and ``transfer_error_deg`` of every single transfer, against what exact arms
     would have done. Their ``bias`` is the mean error: in mm along and across (to the left of) the ray from the arm's base to the place; in
-    deg counter-clockwise.
+    deg counter-clockwise. ``contact_events``: how many of 100 transfers failed where bodies touch (:data:`CONTACT`). ``mean_time_s``: of an
+    episode, on the cell's clock, its motions alone.
     """
     every = [transfer for episode in episodes for transfer in episode.transfers]
     carried = [transfer for transfer in every if transfer.result.refusal is None]
@@ -276,8 +282,10 @@ def loop_report(episodes: Sequence[Episode], rules: Rules) -> dict[str, Any]:
         "orientation_error_deg": _quantiles(turned, 50, 99),
         "refusals": dict(sorted(Counter(str(transfer.result.refusal) for transfer in every if transfer.result.refusal).items())),
         "transfers": len(every),
+        "contact_events": 100 * sum(transfer.result.refusal in CONTACT for transfer in every) / len(every),
         "transfer_error_mm": {**_quantiles(np.hypot(*offsets.T), 50, 95), "bias": offsets.mean(0).tolist() if carried else None},
         "transfer_error_deg": {**_quantiles(abs(turns), 50, 95), "bias": float(turns.mean()) if carried else None},
+        "mean_time_s": float(np.mean([sum(transfer.result.duration_s for transfer in episode.transfers) for episode in episodes])),
         "planning_ms": _quantiles([transfer.result.planning_ms for transfer in carried], 50, 99),
         "cycle_s": _quantiles([transfer.result.duration_s for transfer in carried], 50, 99),
         "episode_s": _quantiles([episode.wall_s for episode in episodes], 50, 99),

@@ -17,7 +17,7 @@ from marl_handover.errors import HandoverError
 from marl_handover.experiments import statistics
 from marl_handover.experiments.provenance import REPORT_KEYS, TRAINED_KEYS, commits_of, fingerprint, read_record, settings_of
 from marl_handover.experiments.runs import RUN_FOLDER, TRAINED, Task
-from marl_handover.experiments.suite import BAR_MEASURES, REPORTED, RowSpec, Suite
+from marl_handover.experiments.suite import BAR_MEASURES, PAIRED_MEASURES, REPORTED, RowSpec, Suite, TableSpec
 from marl_handover.learning.recorder import Metrics, common_curve, read_metrics
 from marl_handover.task.rules import Outcome
 
@@ -74,6 +74,7 @@ def gather(suite: Suite, tasks: Sequence[Task], failures: Mapping[str, str], who
         "failures": failed,
     }
     content["comparisons"] = _comparisons(content)
+    content["paired"] = [entry for spec in suite.tables if spec.kind == "paired" for entry in _paired(content, spec)]
     content["profiles"] = {spec.name: _profiles(content, spec.rows, spec.evaluations) for spec in suite.figures if spec.kind == "profiles"}
     return content
 
@@ -200,6 +201,39 @@ def _comparisons(content: Tree) -> list[Tree]:
                         entry["evaluations"][name] = statistics.improvement(*scores)._asdict()
                 found.append(entry)
     return found
+
+
+def _paired(content: Tree, spec: TableSpec) -> list[Tree]:
+    """Each measure of each row in both evaluations, and what the second has more, over the runs that were judged by both."""
+    found = []
+    for row in content["rows"]:
+        pairs = [
+            [run["evaluations"][name] for name in spec.evaluations]
+            for run in row["runs"]
+            if set(spec.evaluations) <= set(run["evaluations"])
+        ]
+        if not pairs or (spec.rows and row["name"] not in spec.rows):
+            continue
+        values = [[[_part(report, measure) for measure in PAIRED_MEASURES] for report in pair] for pair in pairs]
+        known = [index for index in range(len(PAIRED_MEASURES)) if all(side[index] is not None for pair in values for side in pair)]
+        table = np.array(values, float)[..., known]  # (runs, 2, measures)
+        sides = [*table.transpose(1, 0, 2), table[:, 1] - table[:, 0]]
+        first, second, more = (statistics.summarised(side[:, None, :], statistics.mean) for side in sides)
+        for index, one, other, difference in zip(known, first, second, more, strict=True):
+            about = {"table": spec.name, "row": row["name"], "measure": PAIRED_MEASURES[index], "runs": len(pairs)}
+            found.append({**about, "first": one._asdict(), "second": other._asdict(), "difference": difference._asdict()})
+    return found
+
+
+def _part(report: Tree, measure: str) -> float | None:
+    """A measure whose name leads into a report, as ``transfer_error_mm.bias.0`` does; None where there is none."""
+    found: Any = report
+    for word in measure.split("."):
+        try:
+            found = found[int(word)] if isinstance(found, list) else found[word]
+        except (KeyError, TypeError, IndexError):
+            return None
+    return None if found is None else float(found)
 
 
 def _sooner(first: Tree, second: Tree) -> Tree | None:

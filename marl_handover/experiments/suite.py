@@ -37,6 +37,22 @@ BAR_MEASURES = (
     "path_mm",
     "executor_path_mm",
 )
+PAIRED_MEASURES = (
+    "success_rate",
+    "success_in_the_end",
+    "transfer_error_mm.p50",
+    "transfer_error_mm.p95",
+    "transfer_error_mm.bias.0",
+    "transfer_error_mm.bias.1",
+    "transfer_error_deg.p50",
+    "transfer_error_deg.p95",
+    "transfer_error_deg.bias",
+    "contact_events",
+    "mean_time_s",
+    "episode_s.p50",
+)
+"""What two evaluations of the same problems are held against each other by; dots lead into a report."""
+
 CURVE_AXES = ("step", "share")
 FIGURES = {
     "curves": ("rows", "measure", "x"),
@@ -53,6 +69,7 @@ TABLES = {
     "runs": ("rows",),
     "comparison": ("evaluations", "pairs"),
     "range": ("rows", "evaluations"),
+    "paired": ("rows", "evaluations"),
 }
 """The same of tables."""
 
@@ -117,7 +134,7 @@ class TableSpec:
     """One table, as Markdown and CSV."""
 
     name: str = ""
-    kind: str = ""  # evaluation, milestones, runs, comparison, range
+    kind: str = ""  # evaluation, milestones, runs, comparison, range, paired: two evaluations of the same problems
     title: str = ""
     rows: list[str] = field(default_factory=list)
     evaluations: list[str] = field(default_factory=list)  # as of figures
@@ -301,6 +318,8 @@ def check(suite: Suite) -> None:
         _check_shown(suite, f"tables: {table.name}", table, TABLES)
         if table.kind == "comparison":
             _check_pairs(suite, table)
+        if table.kind == "paired" and len(table.evaluations) != 2:
+            raise BadEntry(f"tables: {table.name}: evaluations", "two of them are held against each other: [one, other]")
     _check_shield(suite)
     _check_profiles(suite)
 

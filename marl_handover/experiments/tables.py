@@ -67,6 +67,7 @@ def make_tables(results: Tree) -> list[Table]:
         "runs": _runs,
         "comparison": _comparison,
         "range": _range,
+        "paired": _paired,
     }
     tables = [Table(spec["name"], spec["title"] or spec["name"], *makers[spec["kind"]](results, spec)) for spec in results["tables"]]
     return [table for table in tables if table.rows]
@@ -227,6 +228,39 @@ def _range(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
             seconds = [run["trained"]["wall_s"] for run in runs if run["trained"]]
             cells.append(_plain(statistics.median(seconds) if seconds else None))
             rows.append([*cells, _text(", ".join(dict.fromkeys(report["machine"]["cpu"] for report in reports)))])
+    return columns, rows
+
+
+PAIRED = {
+    "success_rate": ("success at the first verdict, %", "{:.1f}", 100.0),
+    "success_in_the_end": ("success in the end, %", "{:.1f}", 100.0),
+    "transfer_error_mm.p50": ("a transfer off, median, mm", "{:.3f}", 1.0),
+    "transfer_error_mm.p95": ("the same, 95th percentile, mm", "{:.3f}", 1.0),
+    "transfer_error_mm.bias.0": ("bias away from the arm's base, mm", "{:+.3f}", 1.0),
+    "transfer_error_mm.bias.1": ("bias to its left, mm", "{:+.3f}", 1.0),
+    "transfer_error_deg.p50": ("turned off, median, °", "{:.3f}", 1.0),
+    "transfer_error_deg.p95": ("the same, 95th percentile, °", "{:.3f}", 1.0),
+    "transfer_error_deg.bias": ("bias counter-clockwise, °", "{:+.3f}", 1.0),
+    "contact_events": ("missed, dropped, tipped, collided, of 100 transfers", "{:.2f}", 1.0),
+    "mean_time_s": ("an episode on the cell's clock, s", "{:.2f}", 1.0),
+    "episode_s.p50": ("an episode to compute, median, s", "{:.2f}", 1.0),
+}
+"""Measures of the table of pairs: heading, form, scale."""
+
+
+def _paired(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
+    """The same problems in two evaluations: each measure in both, and what the second has more."""
+    labels = {item["name"]: item["label"] or item["name"] for item in results["evaluations"]}
+    names = {row["name"]: row["label"] for row in results["rows"]}
+    one, other = spec["evaluations"]
+    columns = [Column("row"), Column("measure"), _interval_column(labels[one], one), _interval_column(labels[other], other)]
+    columns.append(_interval_column(f"{labels[other]} less {labels[one]}", "difference"))
+    rows = []
+    for found in (found for found in results["paired"] if found["table"] == spec["name"]):
+        title, form, scale = PAIRED[found["measure"]]
+        signed = form if "+" in form else form.replace("{:", "{:+")
+        values = [_interval(found["first"], form, scale), _interval(found["second"], form, scale)]
+        rows.append([_text(names[found["row"]]), _text(title), *values, _interval(found["difference"], signed, scale)])
     return columns, rows
 
 
