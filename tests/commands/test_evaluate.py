@@ -280,6 +280,8 @@ def test_a_noisy_external_finish_is_traced_as_what_it_was(tmp_path):
 LOOP_FIELDS = {
     *("success_in_the_end", "ended", "position_error_mm", "orientation_error_deg", "refusals", "transfers", "transfer_error_mm"),
     *("transfer_error_deg", "planning_ms", "cycle_s", "episode_s", "chart_inset", "position_tolerance_mm"),
+    "contact_events",
+    "mean_time_s",
 }
 LOOP_TRACE_FIELDS = {"attempt", "refusal", "detail", "planning_ms", "duration_s", "path_mm"}
 
@@ -326,6 +328,8 @@ def test_a_few_problems_in_the_simulated_cell(tmp_path, engine):
     assert set(result) == FIELDS | LOOP_FIELDS | {"symmetry_order", "grasp"}
     assert result["success_rate"] == result["success_in_the_end"] == 1.0
     assert result["transfer_error_mm"]["p95"] <= 2.0
+    assert result["contact_events"] == 0
+    assert 1.0 < result["mean_time_s"] / result["transfers"] < 10.0
     assert 0 < max(math.dist(line["next_state"][:2], line["place"]) for line in lines) < 5.0  # measured, not commanded
 
 
@@ -353,6 +357,9 @@ def test_transfers_are_priced_as_the_arms_move(tmp_path, monkeypatch):
     ("arguments", "word"),
     [
         (["grasp=friction"], "backend=bullet"),
+        (["grasp=friction", "backend=noisy"], "backend=bullet or mujoco"),
+        (["engine=mujoco", "backend=bullet"], "backend=twin"),
+        (["engine=havok", "backend=twin"], "bullet, mujoco"),
         (["backend=bullet", "missed_grasps=0.1"], "backend=noisy"),
         (["backend=bullet", "task.noise.yaw_deg=1"], "task.noise"),
         (["backend=bullet", "grasp=magnet"], "friction, constraint"),

@@ -22,10 +22,18 @@ def simulate(*arguments):
     return run(compose(SCHEMA, list(arguments), groups=GROUPS, aliases=ALIASES))
 
 
-def test_an_episode_is_played_and_filmed(tmp_path, capsys):
+def test_an_episode_is_played_and_filmed(tmp_path, capsys, engine):
     video = tmp_path / "a.gif"
     # One arm reaches both places, and the goal is turned by what that transfer turns the block: one transfer.
-    arguments = ["start=[60,-10,0]", "goal=[-60,-10,-35.1]", f"video={video}", "fps=2", "size=[64,36]", "grasp=constraint"]
+    arguments = [
+        "start=[60,-10,0]",
+        "goal=[-60,-10,-35.1]",
+        f"video={video}",
+        "fps=2",
+        "size=[64,36]",
+        "grasp=constraint",
+        f"engine={engine}",
+    ]
     assert simulate(*arguments, "progress=false") == 0
     out = capsys.readouterr().out
     assert "success after" in out

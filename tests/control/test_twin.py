@@ -24,8 +24,15 @@ PARKED = np.radians(PARKED_DEG)
 
 
 @pytest.fixture
-def twin(model):
-    twin = Twin(model, MotionConfig(), twin_workcell())
+def config(engine):
+    config = twin_workcell()
+    config.twin.engine = engine
+    return config
+
+
+@pytest.fixture
+def twin(model, config):
+    twin = Twin(model, MotionConfig(), config)
     yield twin
     twin.close()
 
@@ -61,10 +68,10 @@ def test_bytes_move_servos_and_servos_move_the_physics(twin, driver):
     assert isinstance(twin.clock, VirtualClock)
 
 
-def test_equal_twins_do_the_same(model, tmp_path):
+def test_equal_twins_do_the_same(model, config, tmp_path):
     ends = []
     for number in range(2):
-        twin = Twin(model, MotionConfig(), twin_workcell())
+        twin = Twin(model, MotionConfig(), config)
         latch = StopLatch(tmp_path / f"stop{number}")
         with ArmDriver(twin.hardware, model, MotionConfig(), clock=twin.clock, latch=latch, confirm=twin.confirm) as driver:
             driver.arm()

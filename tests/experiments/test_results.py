@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import pytest
 
 from marl_handover.errors import UnknownChoice
-from marl_handover.experiments.results import _sooner
-from marl_handover.experiments.tables import csv_text, expected_lines, make_tables, markdown
+from marl_handover.experiments.results import _paired, _sooner
+from marl_handover.experiments.suite import PAIRED_MEASURES, TableSpec
+from marl_handover.experiments.tables import PAIRED, csv_text, expected_lines, make_tables, markdown
 
 
 def row(budget: int, *reached: int | None):
@@ -89,3 +92,30 @@ def test_how_many_runs_have_solved_anything_is_told():
     assert "| 5 (≈ 90 %) |" in text
     assert "\na|b," in csv_text(table)
     assert "steps_ratio_runs,path_mm,path_mm_low,path_mm_high" in csv_text(table)
+
+
+def test_two_evaluations_of_the_same_problems_are_held_against_each_other():
+    """The difference is of each seed for itself: its interval is narrower than those of the two sides; what no report has is left out."""
+    errors = {"one": (1.0, 2.0, 3.0), "other": (1.5, 2.5, 3.5)}
+    runs = [
+        {
+            "evaluations": {
+                name: {"success_rate": 1.0, "transfer_error_mm": {"p50": at[seed], "bias": [0.1, -0.2]}} for name, at in errors.items()
+            }
+        }
+        for seed in range(3)
+    ]
+    spec = TableSpec(name="t", kind="paired", evaluations=["one", "other"])
+    rows = [{"name": "a", "label": "A", "runs": [*runs, {"evaluations": {"one": {"success_rate": 0.0}}}]}]
+    found = {entry["measure"]: entry for entry in _paired({"rows": rows}, spec)}
+    assert list(found) == ["success_rate", "transfer_error_mm.p50", "transfer_error_mm.bias.0", "transfer_error_mm.bias.1"]
+    median = found["transfer_error_mm.p50"]
+    assert median["runs"] == 3
+    assert (median["first"]["value"], median["second"]["value"]) == (2.0, 2.5)
+    assert median["difference"] == {"value": 0.5, "low": 0.5, "high": 0.5}
+    assert median["first"]["low"] < 1.5
+    asked = {"tables": [asdict(spec)], "evaluations": [{"name": "one", "label": ""}, {"name": "other", "label": "Other"}]}
+    (table,) = make_tables({**asked, "rows": rows, "paired": list(found.values())})
+    assert "| A | a transfer off, median, mm | 2.000 [" in markdown(table)
+    assert "+0.500 [+0.500, +0.500] |" in markdown(table)
+    assert set(PAIRED) == set(PAIRED_MEASURES)
