@@ -41,8 +41,8 @@ def suite(tmp_path) -> Suite:
     return load_suite(written(tmp_path, MINIMAL))
 
 
-def test_five_suites_are_shipped():
-    assert SHIPPED == ["ablations", "paper", "paper_steps", "seeds", "variants"]
+def test_six_suites_are_shipped():
+    assert SHIPPED == ["ablations", "engines", "paper", "paper_steps", "seeds", "variants"]
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -63,8 +63,9 @@ def test_every_shipped_row_composes(name, size):
 def test_a_shipped_suite_has_its_seeds_and_pictures_of_each_kind_it_names(name):
     suite = load_suite(name)
     assert suite.seeds == {"seeds": 20, "paper_steps": 3}.get(name, 5)
-    assert {"evaluation", "milestones", "runs"} <= {table.kind for table in suite.tables}
-    assert {"curves", "bars"} <= {figure.kind for figure in suite.figures}
+    trained = any(row.train is not None for row in suite.rows)
+    assert ({"evaluation", "milestones", "runs"} if trained else {"evaluation", "paired"}) <= {table.kind for table in suite.tables}
+    assert ({"curves", "bars"} if trained else set()) <= {figure.kind for figure in suite.figures}
 
 
 def test_tasks_are_rows_by_seeds_with_arguments_from_weak_to_strong(suite):
@@ -153,6 +154,7 @@ def test_seeds_and_rows_from_the_command_line(suite):
         ("quick:", "tables: [{name: t, kind: runs, pairs: [[a, b]]}]\nquick:", "tables: t: pairs: the kind runs"),
         ("quick:", "tables: [{name: t, kind: comparison}]\nquick:", "a comparison needs some"),
         ("quick:", "tables: [{name: t, kind: comparison, pairs: [[a]]}]\nquick:", "a pair has two rows"),
+        ("quick:", "tables: [{name: t, kind: paired, evaluations: [kinematic]}]\nquick:", "two of them are held against each other"),
         ("quick:", "tables: [{name: t, kind: comparison, pairs: [[a, z]]}]\nquick:", "tables: t: pairs"),
         ("seeds: 3", "seeds: 99999999999", "seeds = 99999999999: must be between 1 and 1000"),
         ("{name: b, train: []}", "{name: b, train: [], seeds: 1001}", r"\(b\): seeds = 1001"),
