@@ -1,4 +1,4 @@
-"""Put the results of suites into docs/results.md: ``python scripts/results_docs.py [partial=true] [OUT ...]``.
+"""Put the results of suites into the pages that show them: ``python scripts/results_docs.py [partial=true] [OUT ...]``.
 
 Each OUT, the folder of a finished ``marl-handover compare``, is stored as evidence under bench/results/compare first. With ``partial=true``
 one that does not have all rows and seeds yet is taken, too, and the page says so.
@@ -12,14 +12,16 @@ from marl_handover.experiments.tables import filled, read_evidence, store_eviden
 from marl_handover.files import write_whole
 
 ROOT = Path(__file__).resolve().parents[1]
-EVIDENCE, PAGE, PICTURES = ROOT / "bench" / "results" / "compare", ROOT / "docs" / "results.md", "../bench/results/compare"
+EVIDENCE, PICTURES = ROOT / "bench" / "results" / "compare", "../bench/results/compare"
+PAGES = (ROOT / "docs" / "results.md", ROOT / "docs" / "engines.md")
 PARTIAL = "partial=true"
 
 if __name__ == "__main__":
     try:
         for out in (argument for argument in sys.argv[1:] if argument != PARTIAL):
             print(f"stored: {store_evidence(Path(out), EVIDENCE, partial=PARTIAL in sys.argv[1:])}")
-        write_whole(PAGE, filled(PAGE.read_text(encoding="utf-8"), read_evidence(EVIDENCE), PICTURES))
+        for page in PAGES:
+            write_whole(page, filled(page.read_text(encoding="utf-8"), read_evidence(EVIDENCE), PICTURES))
     except HandoverError as error:
         sys.exit(str(error))
-    print(f"written: {PAGE}")
+    print(f"written: {', '.join(map(str, PAGES))}")

@@ -1,4 +1,4 @@
-"""The page of results says what the stored results say, and nothing where there are none."""
+"""The pages of results say what the stored results say, and nothing where there are none."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from marl_handover.experiments.suite import load_suite, suite_folder
 from marl_handover.experiments.tables import NOT_RUN, blocks, filled, make_tables, markdown, partial_line, read_evidence
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
-BLOCKS = blocks(PAGE)
+PAGE, ENGINES = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("results.md", "engines.md"))
+BLOCKS = blocks(PAGE) + blocks(ENGINES)
 EVIDENCE = read_evidence(ROOT / "bench" / "results" / "compare")
 SINGLE = ROOT / "bench" / "results" / "2026-11-22"
 """Runs outside the suites."""
@@ -22,7 +22,7 @@ LATER = ROOT / "bench" / "results" / "2026-11-30"
 SUITES = sorted(path.stem for path in suite_folder().glob("*.yaml"))
 
 
-def test_the_page_has_a_block_for_every_table_and_figure_of_every_suite():
+def test_the_pages_have_a_block_for_every_table_and_figure_of_every_suite():
     wanted = {
         (kind, name, spec.name)
         for name in SUITES
@@ -34,7 +34,7 @@ def test_the_page_has_a_block_for_every_table_and_figure_of_every_suite():
 
 
 def test_every_mark_is_closed():
-    assert len(re.findall(r"<!-- (?:table|figure):", PAGE)) == len(re.findall(r"<!-- end -->", PAGE)) == len(BLOCKS)
+    assert len(re.findall(r"<!-- (?:table|figure):", PAGE + ENGINES)) == len(re.findall(r"<!-- end -->", PAGE + ENGINES)) == len(BLOCKS)
 
 
 def said_first(block) -> str:
@@ -77,7 +77,8 @@ def test_no_table_of_numbers_stands_outside_the_blocks():
 
 
 def test_filling_the_page_again_changes_nothing():
-    assert filled(PAGE, EVIDENCE, "../bench/results/compare") == PAGE
+    for page in (PAGE, ENGINES):
+        assert filled(page, EVIDENCE, "../bench/results/compare") == page
 
 
 @pytest.mark.parametrize("suite", sorted(EVIDENCE))
