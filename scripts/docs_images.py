@@ -1,6 +1,7 @@
 """Make the pictures of the docs, into docs/img: ``python scripts/docs_images.py [NAME ...]``.
 
-Without names all but the film, which takes minutes. Names: workspace, plan, motion, learning, errors, confusion, twin_camera, handover.
+Without names all but the film, which takes minutes. Names: workspace, plan, motion, learning, errors, confusion, twin_camera, handover, and
+those of ``many_arms_images.py``.
 """
 
 import math
@@ -9,6 +10,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from many_arms_images import FIGURES
 from PIL import Image
 
 from marl_handover import cli
@@ -22,7 +24,7 @@ from marl_handover.perception.detector import Detector
 from marl_handover.perception.overlay import Mark, annotated
 from marl_handover.perception.scene import CellPainter
 from marl_handover.perception.settings import MountConfig, TargetConfig
-from marl_handover.report.figure_style import SERIES
+from marl_handover.report.figure_style import SERIES, save_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "img"
@@ -80,7 +82,7 @@ def lines(name: str) -> list[list[str]]:
     """The commands that make one of the pictures."""
     if name == "handover":
         return [FILM]
-    if name == "twin_camera":
+    if name == "twin_camera" or name in FIGURES:
         return []
     first = [FIRST[name]] if name in FIRST else []
     return [*first, [*COMMANDS[name], f"out={IMAGES / name}.png"]]
@@ -93,6 +95,9 @@ def main(names: list[str]) -> int:
         for name in names:
             if name == "twin_camera":
                 twin_camera(IMAGES / "twin_camera.png")
+            if name in FIGURES:
+                save_figure(FIGURES[name](), IMAGES / f"{name}.png")
+                print(f"written: {IMAGES / name}.png")
             for line in lines(name):
                 if status := cli.main([part.format(work=work) for part in line]):
                     return status
@@ -102,4 +107,4 @@ def main(names: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:] or [*COMMANDS, "twin_camera"]))
+    sys.exit(main(sys.argv[1:] or [*COMMANDS, "twin_camera", *FIGURES]))
