@@ -188,7 +188,7 @@ class CellConfig:
     arms: list[ArmConfig] = sized(
         list, 0, MOST_ARMS
     )  # one entry an arm; empty, or two that are not placed: face to face, base_distance_mm apart
-    obstacles: list[ObstacleConfig] = sized(list, 0, 64)
+    obstacles: list[ObstacleConfig] = sized(list, 0, 64)  # discs on which nothing may be put: x_mm, y_mm, radius_mm, height_mm
     base_distance_mm: float | None = bounded(None, 10.0, 10_000.0)  # null: 0.78 of the sum of the outer radii, if that gives a shared space
     grasp_link: str = ""  # the robots' tip
     pick_height_mm: float | None = bounded(None, *PICK_HEIGHT_MM)
@@ -199,7 +199,7 @@ class CellConfig:
     fit_rounding_mm: float = bounded(1.0, 0.0, 100.0)  # fitted radii are rounded inwards to a multiple of this; 0 keeps them
     r_min_mm: float | None = bounded(None, 1.0, 10_000.0)  # rings begin no nearer than this ...
     r_max_mm: float | None = bounded(None, 1.0, 10_000.0)  # ... and end no farther; null: what the arms reach
-    chart: str | None = chosen(None, CHARTS)  # of what two arms share; null: the paper's for equal rings face to face, else by angles
+    chart: str | None = chosen(None, CHARTS)  # paper or angle; null: paper for two equal rings face to face without obstacles, else angle
     chart_inset: float = bounded(1.0, 0.1, 1.0)  # part of the chart that is used: 1 = all, 0.95 leaves room for placement noise
     block: BlockConfig = field(default_factory=BlockConfig)
 

@@ -181,7 +181,7 @@ class GripperCalibration:
     Args:
         backend: of the cell.
         planner: of the arms' motions.
-        assistant: puts the block back when it has fallen.
+        operator: puts the block back when it has fallen.
         progress: is told of each try: the arm, how far it closed beyond the settings in mm, whether it held.
     """
 

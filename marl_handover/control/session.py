@@ -79,7 +79,7 @@ class Session:
     Args:
         loop: around a :class:`HardwareBackend`.
         about: goes into the log's first line.
-        desk: where somebody may lay wishes: to pause, to go on, another goal. None: nobody can.
+        command_queue: where somebody may put what is wished: to pause, to go on, another goal. None: nobody can.
     """
 
     def __init__(self, loop: ClosedLoop, about: dict[str, Any], command_queue: CommandQueue | None = None) -> None:

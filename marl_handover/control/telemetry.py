@@ -258,7 +258,7 @@ class SessionState:
     Args:
         loop: the session's.
         backend: the loop's.
-        desk: where wishes lie.
+        command_queue: where wishes lie.
     """
 
     def __init__(self, loop: ClosedLoop, backend: HardwareBackend, command_queue: CommandQueue) -> None:

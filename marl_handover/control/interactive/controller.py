@@ -133,7 +133,7 @@ class InteractiveController:
         message: the last event.
 
     Args:
-        decider: the supervisor.
+        adapter: of the supervisor.
         model: the cell.
         planner: of its arms.
         seed: of the problems.
