@@ -1,9 +1,10 @@
-"""What can be added from outside is one file in any folder, and found by its name: an arm, a backend, a policy, a layout, an algorithm."""
+"""What can be added is one file in any folder, found by its name: arm, backend, policy, layout, algorithm, physics engine."""
 
 from __future__ import annotations
 
 import json
 import pickle
+import re
 import subprocess
 import sys
 
@@ -11,7 +12,7 @@ import pytest
 
 from marl_handover import plugins
 from marl_handover.cli import main
-from marl_handover.config import BACKENDS, LAYOUTS
+from marl_handover.config import BACKENDS, ENGINES, LAYOUTS
 from marl_handover.experiments.executor import fan_out
 from marl_handover.learning.algorithm import LEARNERS
 from marl_handover.learning.settings import ALGORITHMS
@@ -34,6 +35,18 @@ class Coarse(NoisyBackend):
         done = super()._moved(arm, transfer)
         self.put(done.pose.round(0))
         return done._replace(pose=self._pose.copy())
+"""
+
+ENGINE = """
+from marl_handover.config import ENGINES
+from marl_handover.simulation.engine import default_engine
+
+
+@ENGINES.register("told")
+class Told(ENGINES[default_engine()]):
+    def close(self):
+        print(f"{self.time_s:.1f} s have passed")
+        super().close()
 """
 
 POLICY = """
@@ -112,7 +125,7 @@ def write(tmp_path, monkeypatch):
 
     yield make
     added = {"bolder": (ALGORITHMS._entries, LEARNERS), "coarse": (BACKENDS._entries,), "hesitant": (POLICIES._entries,)}
-    for name, tables in (added | {"difference": (LAYOUTS._entries,)}).items():
+    for name, tables in (added | {"difference": (LAYOUTS._entries,), "told": (ENGINES._entries,)}).items():
         for table in tables:
             table.pop(name, None)
 
@@ -136,6 +149,13 @@ def test_a_backend(write, tmp_path):
     file = write("coarse.py", BACKEND)
     report = evaluated(tmp_path, f"plugins={file}", "backend=coarse", "episodes=3")
     assert (report["backend"], report["episodes"]) == ("coarse", 3)
+
+
+def test_a_physics_engine(write, capsys):
+    file = write("told.py", ENGINE)
+    problem = ["start=[60,-10,0]", "goal=[-60,-10,-35.1]", "grasp=constraint"]
+    assert main(["simulate", f"plugins={file}", "engine=told", *problem, "progress=false"]) == 0
+    assert re.search(r"^[\d.]+ s have passed$", capsys.readouterr().out, re.MULTILINE)
 
 
 def test_a_policy(write, tmp_path, capsys):

@@ -309,9 +309,11 @@ class _Window:
         self._model = _compiled(scene, Look())
         self._data, self._shown_s = mujoco.MjData(self._model), 0.0
         try:
-            self._viewer = mujoco.viewer.launch_passive(self._model, self._data)
+            self._viewer = mujoco.viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
         except Exception as error:  # what a display that is there does not do
             raise NoWindow("MuJoCo") from error
+        eye = self._viewer.cam
+        eye.lookat[:], eye.distance, eye.azimuth, eye.elevation = (0.0, 0.0, 0.1), 1.0, 0.0, -45.0
 
     def show(self, qpos: Floats, time_s: float) -> None:
         """Draw anew if it is time to."""
