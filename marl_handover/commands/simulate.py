@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from marl_handover import policies
 from marl_handover.arrays import Floats, wrap
 from marl_handover.cell import build_cell
-from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import (
     CELL_ALIASES,
     ENGINES,
@@ -90,6 +89,8 @@ def run(config: SimulateCommand) -> int:
     for name in ("start", "goal"):
         if (pose := getattr(config, name)) is not None:
             policy.rules.cell.require_reached(name, pose)
+    if config.video and config.captions:
+        policy.rules.cell.require_pair("a video's words below the picture, captions=true,")
     model = build_cell(policy.rules.cell.config)
     camera = view(config.view, model.cell)
     backend = PhysicsBackend(model, config.motion, engine=config.engine, grasp=config.grasp, gui=config.gui, camera=camera, size=size)
@@ -177,7 +178,7 @@ def play(
 ) -> Played:
     """Play one episode from where ``env`` was reset to; ``say`` gets one line a transfer, ``film`` is told whose turn it is."""
     simulated, began, stopped = 0.0, time.perf_counter(), False
-    goal = env.observe("supervisor")["goal"]
+    goal, labels = env.observe("supervisor")["goal"], env.model.cell.labels
     say(f"object {_pose(backend.cell.object_pose())} to goal {_pose(goal)}")
     while not (env.terminations["supervisor"] or env.truncations["supervisor"]):
         agent = env.agent_selection
@@ -201,7 +202,7 @@ def play(
         came = "done" if refusal is None else f"{refusal}{_reason(arms[agent])}"
         rate = seconds / (time.perf_counter() - started)
         say(
-            f"  {ARM_LETTERS[arms[agent].arm]} to ({observation['target'][0]:z.1f} mm, {observation['target'][1]:z.1f} mm): {came}; "
+            f"  {labels[arms[agent].arm]} to ({observation['target'][0]:z.1f} mm, {observation['target'][1]:z.1f} mm): {came}; "
             f"object {_pose(backend.cell.object_pose())}; {seconds:.1f} s, {rate:.1f} x real time"
         )
     infos = env.infos["supervisor"]  # empty at the reset

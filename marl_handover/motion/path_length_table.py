@@ -174,8 +174,8 @@ def path_length_table(cell: Cell, motion: MotionConfig, arm: int = 0) -> PathLen
 
 
 def known_table(cell: Cell, motion: MotionConfig) -> PathLengthTable | None:
-    """The table of a cell of arms that are alike, if it is shipped or was kept from before; nothing is built."""
-    return _found(settings_key(cell, motion)) if _alike(cell) else None
+    """The table of a pair of arms that are alike, if it is shipped or was kept from before; nothing is built."""
+    return _found(settings_key(cell, motion)) if cell.num_arms == 2 and _alike(cell) else None
 
 
 def _alike(cell: Cell) -> bool:

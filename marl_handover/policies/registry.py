@@ -248,7 +248,13 @@ def content_hash(name: str) -> str:
 
 
 def _rules(cell: Cell, task: TaskConfig, motion: MotionConfig | None, about: Mapping[str, Any] | None = None) -> Rules:
-    """The rule book that training used too; ``about`` is what a policy file says of itself."""
+    """The rule book that training used too; ``about`` is what a policy file says of itself.
+
+    Raises:
+        TwoArmsOnly: the policy of a file is to act in a cell of other than two arms.
+    """
+    if about:
+        cell.require_pair("a trained policy")
     if about and about["variant"] == "centralised":
         from marl_handover.envs.centralised import CentralisedRules
 

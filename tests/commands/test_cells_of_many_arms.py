@@ -92,7 +92,7 @@ def test_a_problem_without_a_plan_is_told_why(tmp_path, capsys):
     [
         (["start=[2000,0,0]"], "start (2000, 0) mm is out of every arm's reach"),
         (["start=[0,-60,0]"], "start (0, -60) mm is inside an obstacle; it must be at least 43.3 mm from (0, -60) mm"),
-        (["policy=pretrained_b"], "is for two arms; this cell has 3: west, east, a rather long name"),
+        (["policy=pretrained_b"], "a trained policy is for two arms; this cell has 3: west, east, a rather"),
         (["policy=shielded:pretrained_a", "architecture=A"], "is for two arms; this cell has 3"),
         (["motion=m.json", "start=[-180,-200,0]", "goal=[180,-200,0]"], "cell.obstacles = '2 of them': must be none where arms move"),
         (["cell.chart=paper"], "cell.chart = 'paper'"),
@@ -108,3 +108,23 @@ def test_bad_input_is_one_line(tmp_path, capsys, arguments, words):
     error = capsys.readouterr().err
     assert words in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_evaluate_plays_shipped_cells_and_plot_reads_its_trace(tmp_path, name):
+    trace, report = tmp_path / "trace.jsonl", tmp_path / "report.json"
+    assert main(["evaluate", f"cell={name}", "episodes=40", f"trace={trace}", f"json={report}", "progress=false"]) == 0
+    names = set(build_cell(cell_config(name)).cell.names)
+    rows, result = [json.loads(line) for line in trace.read_text().splitlines()], json.loads(report.read_text())
+    assert {row["arm"] for row in rows} == names
+    assert all((row["receiver"] is None) == row["final"] for row in rows)
+    assert result["success_rate"] == result["steps_ratio"] == 1.0
+    for kind in ("evaluation", "confusion"):
+        files = [f"trace={trace}", *([f"json={report}"] if kind == "evaluation" else [])]
+        assert main(["plot", f"kind={kind}", *files, f"cell={name}", f"out={tmp_path / 'picture.png'}"]) == 0
+
+
+@pytest.mark.parametrize("command", ["evaluate", "simulate", "plan"])
+def test_a_trained_policy_of_a_pair_takes_no_third_arm(command, capsys):
+    assert main([command, "cell=triangle", "policy=shielded:pretrained_b"]) == 2
+    assert "a trained policy is for two arms; this cell has 3: north, west, east" in capsys.readouterr().err
