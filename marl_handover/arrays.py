@@ -55,3 +55,15 @@ def select(values: Array, index: Array) -> Array:
 def one_where(condition: Array, chosen: Array, other: Array) -> Array:
     """``where`` for vectors: ``condition`` of shape (...), ``chosen`` and ``other`` of shape (..., n)."""
     return namespace(condition).where(condition[..., None], chosen, other)
+
+
+def kind_of(like: Array) -> tuple[Any, Any]:
+    """What tells apart the kinds of arrays that a table is kept in: number type and device."""
+    return like.dtype, getattr(like, "device", None)
+
+
+def as_kind(table: Floats, like: Array) -> Array:
+    """A table of numpy's as an array of the kind of ``like``."""
+    if isinstance(like, (np.ndarray, np.generic)):
+        return table.astype(like.dtype)
+    return namespace(like).as_tensor(table, dtype=like.dtype, device=like.device)

@@ -39,6 +39,7 @@ __all__ = [
     "CellConfig",
     "CentralisedConfig",
     "DecentralisedConfig",
+    "LayoutConfig",
     "LoopConfig",
     "MotionConfig",
     "NoiseConfig",
@@ -63,7 +64,9 @@ __all__ = [
 
 ARCHITECTURES = ("A", "B")
 LAYOUTS: Registry[Any] = Registry(
-    "layout", {name: f"marl_handover.task.observations:{name.upper()}" for name in ("raw", "relative", "object")}
+    "layout",
+    {name: f"marl_handover.task.observations:{name.upper()}" for name in ("raw", "relative", "object")}
+    | {"graph": "marl_handover.task.graph_observation:GRAPH"},
 )
 """Observation layouts, each a :class:`~marl_handover.task.observations.Layout`."""
 BACKENDS: Registry[Any] = Registry(
@@ -207,6 +210,33 @@ class CellConfig:
         """Raise :class:`InvalidSetting` on a value out of its limits, or parts that do not fit each other."""
         check_bounds(self, "cell.")
         self.block.validate()
+
+
+@dataclass
+class LayoutConfig:
+    """Random cells: arms that stand anywhere, as long as every one can pass to every other, by way of others if need be.
+
+    Two numbers are the least and the greatest; each is drawn uniformly, for every arm anew unless it says otherwise.
+    """
+
+    arms: list[int] = bounded(lambda: [2, 5], 2, MOST_ARMS, (2, 2))
+    r_min_mm: list[float] = bounded(lambda: [150.0, 150.0], 1.0, 10_000.0, (2, 2))
+    r_max_mm: list[float] = bounded(lambda: [230.0, 230.0], 1.0, 10_000.0, (2, 2))
+    yaw_deg: list[float] = bounded(lambda: [90.0, 90.0], 1.0, 180.0, (2, 2))  # to either side of the facing
+    spacing_mm: list[float] = bounded(lambda: [305.0, 440.0], 30.0, 10_000.0, (2, 2))  # from an arm that stands to the next one
+    apart_mm: float = bounded(300.0, 30.0, 10_000.0)  # between any two bases
+    obstacles: list[int] = bounded(lambda: [0, 0], 0, 8, (2, 2))  # keep-out discs
+    radius_mm: list[float] = bounded(lambda: [10.0, 40.0], 0.1, 10_000.0, (2, 2))  # of obstacles
+
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` on a value out of its limits, or a least that is above its greatest."""
+        check_bounds(self, "layouts.")
+        for name in ("arms", "r_min_mm", "r_max_mm", "yaw_deg", "spacing_mm", "obstacles", "radius_mm"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise InvalidSetting(f"layouts.{name}", [low, high], "the least first")
+        if self.r_min_mm[1] >= self.r_max_mm[0]:
+            raise InvalidSetting("layouts.r_min_mm", self.r_min_mm, f"below layouts.r_max_mm = {self.r_max_mm}")
 
 
 CELL_ALIASES = {key: f"cell.{key}" for key in ("robot", "shapes")}

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from marl_handover.cell.angle_kernels import Floats, fibre, is_shared, length, seen, split, wrapped
+from marl_handover.cell.angle_kernels import Floats, Ints, fibre, in_frame, is_shared, length, seen, split, wrapped
 from marl_handover.cell.arm import REACH_TOLERANCE_MM
 from marl_handover.compiled import compiled
 
@@ -164,3 +164,52 @@ def _is_wide(pair: Floats, discs: Floats, begin: float, end: float, out: Floats,
         if length(out, fibre(pair, discs, eta, out, edges)) * pair[0] > REACH_TOLERANCE_MM * split(pair, eta)[3]:
             return True
     return False
+
+
+@compiled
+def pair_row(arms: Floats, i: int, j: int, row: Floats) -> None:
+    """Fill the row (15,) of two arms; ``arms`` (N, 8) are x, y, facing, least and greatest radius and yaw, lateral offset."""
+    dx, dy = arms[i, 0] - arms[j, 0], arms[i, 1] - arms[j, 1]
+    distance = math.hypot(dx, dy)
+    row[0] = distance
+    for number in range(2):
+        arm = i if number == 0 else j
+        handed = 1.0 - 2.0 * number
+        lateral = arms[arm, 7] if abs(arms[arm, 7]) > _WITHIN_MM else 0.0
+        for end in range(2):
+            row[1 + 2 * number + end] = math.sqrt(max(arms[arm, 3 + end] ** 2 - lateral**2, 0.0))
+        row[5 + number] = lateral
+        low, high = arms[arm, 5], arms[arm, 6]
+        towards = wrapped(math.atan2(-handed * dy, -handed * dx) - arms[arm, 2])
+        row[7 + 2 * number] = handed * ((low + high) / 2 - towards)
+        row[8 + 2 * number] = 2 * math.pi if high - low > 2 * math.pi - 1e-6 else (high - low) / 2
+    row[11], row[12] = (arms[i, 0] + arms[j, 0]) / 2, (arms[i, 1] + arms[j, 1]) / 2
+    row[13], row[14] = dy / distance, -dx / distance
+
+
+@compiled
+def layout_edges(arms: Floats, discs: Floats, number: Ints, pairs: Floats, discs_there: Floats, arcs: Floats, n_arcs: Ints) -> int:
+    """All that the arms (N, 8) of a layout share, with keep-out discs (M, 3) in the world, as rows of a table of edges.
+
+    Fills ``number`` (N, N) with the edge of each two arms, -1 where they share nothing, and the first rows of ``pairs`` (E, 15),
+    ``discs_there`` (E, M, 3), ``arcs`` (E, K, 2) and ``n_arcs`` (E,). Gives how many edges there are; -1 if K arcs are too few.
+    """
+    count = 0
+    number[:] = -1
+    for i in range(len(arms)):
+        for j in range(i + 1, len(arms)):
+            if math.hypot(arms[i, 0] - arms[j, 0], arms[i, 1] - arms[j, 1]) >= arms[i, 4] + arms[j, 4]:
+                continue
+            row = pairs[count]
+            pair_row(arms, i, j, row)
+            for disc in range(len(discs)):
+                discs_there[count, disc, 0], discs_there[count, disc, 1] = in_frame(row, discs[disc, 0], discs[disc, 1])
+                discs_there[count, disc, 2] = discs[disc, 2]
+            found = angle_arcs(row, discs_there[count])
+            if len(found) > arcs.shape[1]:
+                return -1
+            if len(found):
+                arcs[count, : len(found)], n_arcs[count] = found, len(found)
+                number[i, j] = number[j, i] = count
+                count += 1
+    return count

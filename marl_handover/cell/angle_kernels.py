@@ -39,7 +39,7 @@ _LEAST_RAD, _LEAST_BESIDE_RAD = 1e-12, 3e-8
 """How near to 0 and pi eta is told from them: without lateral offsets, and with, which cost digits there."""
 
 _STRAIGHT_RAD = 1e-2
-_EDGE_MM = 1e-6
+_POINT_MM = 1e-9
 NEAR_MM = 2e-3
 """A place this near to a shared one has the coordinates of the nearest piece's end: twice the tolerance of reach."""
 
@@ -393,6 +393,10 @@ def coordinates(
             nearest, taken = abs(offset) - arcs[arc, 1], arc
             alpha = start + (arcs[arc, 1] + offset / inset) / unit
         start += 2 * arcs[arc, 1] / unit + GAP
+    if not is_shared(pair, discs, x, y, NEAR_MM):
+        return alpha, OUTSIDE
+    there = min(arcs[taken, 1], max(-arcs[taken, 1], wrapped(eta - arcs[taken, 0])))
+    eta, pieces = _found_fibre(pair, discs, arcs[taken, 0] + there, arcs[taken], out, edges)
     sign, e, _, sin_e = split(pair, eta)
     adds = _beside(pair, sign, e)
     near_1, near_2 = sign * a_1, sign * a_2
@@ -404,36 +408,30 @@ def coordinates(
     a = _arcsine(((r_1 if side == 0 else r_2) * sin_e + adds[side]) / pair[0])
     if a > e / 2:
         side, a = 1 - side, e - a
-    there = min(arcs[taken, 1], max(-arcs[taken, 1], wrapped(eta - arcs[taken, 0])))
-    _, pieces = _found_fibre(pair, discs, arcs[taken, 0] + there, arcs[taken], out, edges)
-    beta = _along(out, pieces, inset, side, a, e, _EDGE_MM * sin_e / pair[0])
-    if math.isnan(beta):
-        beta = _along(out, pieces, inset, side, a, e, math.inf) if is_shared(pair, discs, x, y, NEAR_MM) else OUTSIDE
-    return alpha, beta
+    return alpha, _along(out, pieces, inset, side, a, e, _POINT_MM * sin_e / pair[0])
 
 
 @compiled
-def _along(pieces: Floats, count: int, inset: float, side: int, a: float, e: float, edge: float) -> float:
-    """Beta of the coordinate ``a`` of a side; NaN if it lies more than ``edge`` rad beside all pieces, else on the nearest."""
+def _along(pieces: Floats, count: int, inset: float, side: int, a: float, e: float, point: float) -> float:
+    """Beta of the coordinate ``a`` of a side, or of the nearest place of a piece; a piece shorter than ``point`` rad is one place."""
     total = length(pieces, count)
-    nearest, reached, at = edge, 0.0, math.nan
+    nearest, reached, at = math.inf, 0.0, 0.0
     own = a if side == 0 else e - a
     for number in range(count):
         begin, end = pieces[number, 1], pieces[number, 2]
+        size, here = abs(end - begin), int(pieces[number, 0]) == side
         low, high = (begin, end) if pieces[number, 0] == 0.0 else (e - begin, e - end)
-        beside = max(low - own, own - high)
-        if int(pieces[number, 0]) == side:
-            beside = max(min(begin, end) - a, a - max(begin, end))
-        if beside <= nearest:
+        beside = max(min(begin, end) - a, a - max(begin, end)) if here else max(low - own, own - high)
+        if beside < nearest:
             nearest = beside
-            if beside <= 0.0 and int(pieces[number, 0]) == side:
+            if size <= point:
+                at = reached + size / 2
+            elif beside <= 0.0 and here:
                 middle = (begin + end) / 2
                 at = reached + abs(middle - begin) + (a - middle) / inset * (1.0 if end > begin else -1.0)
             else:
-                at = reached + (0.0 if abs(own - low) < abs(own - high) else abs(end - begin))
-        reached += abs(end - begin)
-    if math.isnan(at):
-        return at
+                at = reached + (0.0 if abs(own - low) < abs(own - high) else size)
+        reached += size
     return 1.0 - 2.0 * at / total if total > 0.0 else 0.0
 
 

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from marl_handover.arrays import Array, namespace, one_where, wrap
+from marl_handover.arrays import Array, Floats, as_kind, kind_of, namespace, one_where
 from marl_handover.cell.arm import REACH_TOLERANCE_MM, Arm, Disc, lateral_rad
 from marl_handover.cell.chart import Chart, PaperChart
+from marl_handover.cell.sectors import Sectors, sector_limits
 from marl_handover.cell.shared_space import HandoverGraph, SharedSpace
 from marl_handover.cell.symmetry import ARM_LETTERS, Symmetry, View, pair_views, symmetries
 from marl_handover.config import CellConfig
@@ -24,7 +25,7 @@ from marl_handover.geometry.se2 import SE2
 
 
 @dataclass(frozen=True)
-class Cell:
+class Cell(Sectors):
     """Continuous model of the cell: an annulus sector an arm, and what they have in common.
 
     Attributes:
@@ -122,6 +123,25 @@ class Cell:
         margin_mm = self.config.block.side_mm / math.sqrt(2)
         return tuple(Disc(each.x_mm, each.y_mm, each.radius_mm + margin_mm) for each in self.config.obstacles)
 
+    def hand_over_arcs(self, like: Array) -> tuple[Array, Array]:
+        """As :class:`Sectors` says; made once for each kind."""
+        key = ("arcs", *kind_of(like))
+        if key not in self._kinds:
+            self._kinds[key] = as_kind(self._arc_table, like)
+        middle, half = self._kinds[key]
+        return middle, half
+
+    @cached_property
+    def _arc_table(self) -> Floats:
+        found = {pair: space.chart.arcs for pair, space in self.graph.edges.items()}
+        table = np.zeros((2, self.num_arms, self.num_arms, max(len(arcs) for arcs in found.values())))
+        table[1] = -1.0
+        for (i, j), arcs in found.items():
+            for number, arc in enumerate(arcs):
+                middle = arc.low_rad + arc.width_rad / 2
+                table[:, i, j, number], table[:, j, i, number] = (middle, arc.width_rad / 2), (-middle, arc.width_rad / 2)
+        return table
+
     @cached_property
     def symmetries(self) -> tuple[Symmetry, ...]:
         """The isometries that take the cell onto itself, the identity first."""
@@ -195,25 +215,6 @@ class Cell:
         """The same cell with another part of the chart in use."""
         return replace(self, config=replace(self.config, chart_inset=chart_inset))
 
-    def polar(self, position_mm: Array) -> tuple[Array, Array]:
-        """Squared radius [mm^2] and base yaw [rad] of positions (..., >= 2) seen from each arm, both (..., num_arms)."""
-        xp = namespace(position_mm)
-        base_x, base_y, facing_x, facing_y = self._constants(position_mm)[:4]
-        dx, dy = position_mm[..., 0:1] - base_x, position_mm[..., 1:2] - base_y
-        forward = facing_x * dx + facing_y * dy
-        left = facing_x * dy - facing_y * dx
-        square, yaw = forward * forward + left * left, xp.atan2(left, forward)
-        if self._has_lateral:
-            lateral = self._constants(position_mm)[9]
-            yaw = wrap(yaw - xp.atan2(lateral, xp.sqrt(xp.clip(square - lateral * lateral, 1e-12, None))))
-        return square, yaw
-
-    def seen(self, position_mm: Array) -> tuple[Array, Array]:
-        """Which arms can place at positions (..., >= 2), and at what base yaw [rad]: bool and float (..., num_arms)."""
-        square, yaw = self.polar(position_mm)
-        reached = self.within(square, yaw)
-        return (reached & self.is_clear(position_mm)[..., None] if self.keep_out else reached), yaw
-
     def is_clear(self, position_mm: Array) -> Array:
         """Whether an object may stand at positions (..., >= 2), whoever puts it there: bool (...)."""
         clear = position_mm[..., 0] == position_mm[..., 0]
@@ -221,19 +222,6 @@ class Cell:
             dx, dy = position_mm[..., 0] - disc.x_mm, position_mm[..., 1] - disc.y_mm
             clear &= dx * dx + dy * dy >= max(disc.radius_mm - REACH_TOLERANCE_MM, 0.0) ** 2
         return clear
-
-    def gripper_yaw(self, yaw_rad: Array) -> Array:
-        """World yaw psi of each gripper, (..., num_arms), from base yaws; not wrapped."""
-        return yaw_rad + self._constants(yaw_rad)[4]
-
-    def within(self, square_mm2: Array, yaw_rad: Array) -> Array:
-        """Whether each arm's squared radius and base yaw, both (..., num_arms), lie in its annulus sector, to 1 um."""
-        low, high, yaw_low, yaw_high = self._sector or self._constants(square_mm2)[5:9]
-        return (square_mm2 >= low) & (square_mm2 <= high) & (yaw_rad >= yaw_low) & (yaw_rad <= yaw_high)
-
-    def reaches(self, position_mm: Array) -> Array:
-        """Which arms can place at positions (..., >= 2): bool (..., num_arms)."""
-        return self.seen(position_mm)[0]
 
     def require_reached(self, what: str, pose: Array) -> None:
         """Raise :class:`OutOfReach`, or :class:`BlockedPlace`, unless an arm can put the pose ``what``, (2,) or (3,) in mm and rad."""
@@ -273,26 +261,16 @@ class Cell:
         return values[0]
 
     def _constants(self, like: Array) -> Array:
-        """Facts of the arms as arrays (10, num_arms) of the kind of ``like``, made once for each kind.
-
-        The base's x, y, facing vector and facing angle; least and greatest squared radius and yaw, tolerances included; the lateral offset.
-        """
-        key = (like.dtype, getattr(like, "device", None))
+        """As :class:`Sectors` says; made once for each kind."""
+        key = kind_of(like)
         if key not in self._kinds:
-            rows = []
-            for arm in self.arms:
-                rows.append([arm.base.x_mm, arm.base.y_mm, *arm.base.facing, arm.base.facing_rad, *_sector(arm), arm.lateral_mm])
-            table = np.array(rows, np.float64).T
-            if isinstance(like, (np.ndarray, np.generic)):
-                self._kinds[key] = table.astype(like.dtype)
-            else:
-                self._kinds[key] = like.new_tensor(table.tolist())
+            self._kinds[key] = as_kind(np.array([_facts(arm) for arm in self.arms], np.float64).T, like)
         return self._kinds[key]
 
     @cached_property
     def _sector(self) -> tuple[float, float, float, float] | None:
         """The limits of every arm's sector, if they are the same: comparing with numbers is quicker than with rows of them."""
-        sectors = {_sector(arm) for arm in self.arms}
+        sectors = {sector_limits(arm.r_min_mm, arm.r_max_mm, *arm.yaw_rad) for arm in self.arms}
         return sectors.pop() if len(sectors) == 1 else None
 
     @cached_property
@@ -300,12 +278,11 @@ class Cell:
         return any(arm.lateral_mm for arm in self.arms)
 
     @cached_property
-    def _kinds(self) -> dict[Any, Array]:
+    def _kinds(self) -> dict[Any, Any]:
         return {}
 
 
-def _sector(arm: Arm) -> tuple[float, float, float, float]:
-    """Least and greatest squared radius [mm^2] and yaw [rad] of an arm's sector, tolerances included."""
-    low, high = arm.r_min_mm - REACH_TOLERANCE_MM, arm.r_max_mm + REACH_TOLERANCE_MM
-    slack = REACH_TOLERANCE_MM / arm.r_min_mm
-    return low * low, high * high, arm.yaw_rad[0] - slack, arm.yaw_rad[1] + slack
+def _facts(arm: Arm) -> list[float]:
+    base = arm.base
+    limits = sector_limits(arm.r_min_mm, arm.r_max_mm, *arm.yaw_rad)
+    return [base.x_mm, base.y_mm, *base.facing, base.facing_rad, *limits, arm.lateral_mm]

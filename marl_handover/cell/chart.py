@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.arrays import Array, Floats, namespace
-from marl_handover.cell.angle_arcs import angle_arcs
+from marl_handover.cell.angle_arcs import angle_arcs, pair_row
 from marl_handover.cell.angle_kernels import PAIR_SIZE, chart_coordinates, middles, place_slopes, places
 from marl_handover.cell.arm import Arm, Disc
 from marl_handover.errors import InvalidSetting, NoSharedSpace
@@ -219,19 +219,10 @@ def _like(values: Floats, like: Array) -> Array:
     return namespace(like).from_numpy(values).to(like.device, like.dtype)
 
 
-def pair_row(first: Arm, second: Arm, frame: SE2) -> Floats:
-    """The geometry of two arms (15,) as :mod:`marl_handover.cell.angle_kernels` has it; ``frame`` is that of the pair."""
-    row = np.empty(PAIR_SIZE)
-    row[0] = math.dist(first.base.position_mm, second.base.position_mm)
-    for number, (arm, other, handed) in enumerate(((first, second, 1), (second, first, -1))):
-        row[1 + 2 * number : 3 + 2 * number] = [math.sqrt(max(r * r - arm.lateral_mm**2, 0.0)) for r in (arm.r_min_mm, arm.r_max_mm)]
-        row[5 + number] = arm.lateral_mm if abs(arm.lateral_mm) > 1e-6 else 0.0
-        ahead = arm.base.to_local(other.base.position_mm)
-        low, high = sorted(handed * (yaw - math.atan2(ahead[1], ahead[0])) for yaw in arm.yaw_rad)
-        whole = high - low > 2 * math.pi - 1e-6
-        row[7 + 2 * number : 9 + 2 * number] = (low + high) / 2, 2 * math.pi if whole else (high - low) / 2
-    row[11:] = frame.x_mm, frame.y_mm, *frame.facing
-    return row
+def arm_row(arm: Arm) -> Floats:
+    """An arm (8,) as the compiled functions have it: x, y, facing, least and greatest radius and yaw, lateral offset."""
+    base = arm.base
+    return np.array([base.x_mm, base.y_mm, base.facing_rad, arm.r_min_mm, arm.r_max_mm, *arm.yaw_rad, arm.lateral_mm])
 
 
 @dataclass(frozen=True)
@@ -292,13 +283,20 @@ class AngleChart:
         """A place (..., 2) in the middle of the longest piece of those that have the hand-over angle ``gamma_rad`` (...)."""
         return self._table.at_angle(np.zeros((), int), gamma_rad)
 
-    def row_in(self, frame: SE2) -> tuple[Floats, Floats, Floats]:
-        """The row of an :class:`EdgeTable` whose places are in the world: geometry, discs, arcs; ``frame`` is that of the pair."""
-        return pair_row(self.first, self.second, frame), self._discs, self._arcs
+    @property
+    def row(self) -> tuple[Floats, Floats, Floats]:
+        """The row of an :class:`EdgeTable` whose places are in the world: geometry, discs, arcs."""
+        row = np.empty(PAIR_SIZE)
+        pair_row(np.stack([arm_row(self.first), arm_row(self.second)]), 0, 1, row)
+        return row, self._discs, self._arcs
 
     @cached_property
     def _row(self) -> Floats:
-        return pair_row(self.first, self.second, SE2(0.0, 0.0, (1.0, 0.0)))
+        """The geometry in the pair's own frame."""
+        row = np.empty(PAIR_SIZE)
+        pair_row(np.stack([arm_row(self.first), arm_row(self.second)]), 0, 1, row)
+        row[11:] = 0.0, 0.0, 1.0, 0.0
+        return row
 
     @cached_property
     def _discs(self) -> Floats:

@@ -37,7 +37,7 @@ class HandoverGraph:
     @cached_property
     def table(self) -> EdgeTable:
         """The angle charts of all edges, in the order of :attr:`edges`."""
-        rows = [space.angle_chart.row_in(space.frame) for space in self.edges.values()]
+        rows = [space.angle_chart.row for space in self.edges.values()]
         pairs, discs, arcs = zip(*rows, strict=True)
         return EdgeTable(np.stack(pairs), discs, arcs, next(iter(self.edges.values())).inset)
 

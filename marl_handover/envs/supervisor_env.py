@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -11,6 +12,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from marl_handover.cell import Cell, load_cell
+from marl_handover.cell.batch import CellBatch, LayoutPool
 from marl_handover.config import TaskConfig, require_at_least, require_positive
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.episode import advance
@@ -34,6 +36,7 @@ class SupervisorEnv(EnvBase):
         device: device of all tensors.
         seed: seed of problems and noise.
         rules: another rule book than that of cell and task.
+        layouts: draw each episode's cell from these, instead of one for all; the tensordict then carries its number, ``layout``.
     """
 
     batch_locked = True
@@ -46,11 +49,17 @@ class SupervisorEnv(EnvBase):
         device: torch.device | str = "cpu",
         seed: int | None = None,
         rules: Rules | None = None,
+        layouts: LayoutPool | None = None,
     ) -> None:
         require_at_least("num_envs", num_envs, 1)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
-        cell, task = cell or load_cell(), task or TaskConfig()
-        self.rules = rules or Rules(cell, task, motion_cost(cell, task))
+        task = task or TaskConfig()
+        self.layouts = layouts
+        if layouts is None:
+            cell = cell or load_cell()
+            self.rules = rules or Rules(cell, task, motion_cost(cell, task))
+        else:
+            self.rules = rules or Rules(CellBatch(layouts, np.zeros(num_envs, np.int64)), task)
         self.generator = torch.Generator(device=self.device)
         self.epsilon_range_rad = (self.rules.epsilon_rad, self.rules.epsilon_rad)
         self._make_specs()
@@ -71,6 +80,8 @@ class SupervisorEnv(EnvBase):
             "feasible": Binary(shape=(count, 1), dtype=torch.bool, device=device),
             "outcome": Bounded(0, max(Outcome), shape=(count, 1), dtype=torch.int64, device=device),
         }
+        if self.layouts is not None:
+            problem["layout"] = Bounded(0, len(self.layouts) - 1, shape=(count, 1), dtype=torch.int64, device=device)
         self.observation_spec = Composite(problem, shape=self.batch_size, device=device)
         self.action_spec = Bounded(-1.0, 1.0, shape=(count, self.rules.action_size), device=device)
         self.reward_spec = Unbounded(shape=(count, 1), device=device)
@@ -102,10 +113,14 @@ class SupervisorEnv(EnvBase):
         # TorchRL takes only the rows that are reset. Where these are many, drawing for all cells costs less than putting some in place.
         everyone = rows is None or len(rows) * 4 >= self.batch_size[0]
         fresh = self.batch_size[0] if everyone or rows is None else len(rows)
-        pose, goal = sample_problems(self.rules.cell, fresh, self.generator, torch.float32)
+        rules, layout = self.rules, None
+        if self.layouts is not None:
+            layout = torch.randint(len(self.layouts), (fresh,), generator=self.generator, device=self.device)
+            rules = self.rules.on(CellBatch(self.layouts, layout.cpu().numpy()))
+        pose, goal = sample_problems(rules.cell, fresh, self.generator, torch.float32)
         epsilon = self.draw_epsilon(fresh)
         previous = torch.full((fresh,), -1, device=self.device)
-        observation = self.observe(pose, goal, previous, epsilon)
+        observation = self.observe(pose, goal, previous, epsilon, rules)
         zero = torch.zeros(fresh, 1, dtype=torch.int64, device=self.device)
         new = {
             "observation": observation,
@@ -118,6 +133,8 @@ class SupervisorEnv(EnvBase):
             "feasible": torch.ones_like(zero, dtype=torch.bool),
             "outcome": zero,
         }
+        if layout is not None:
+            new["layout"] = layout[:, None]
         if rows is not None and not everyone:
             for key, value in new.items():
                 new[key] = value.new_zeros(self.batch_size + value.shape[1:])
@@ -135,24 +152,35 @@ class SupervisorEnv(EnvBase):
         scale = torch.tensor([position_mm, position_mm, math.radians(angle_deg)], device=self.device)
         return torch.randn(count, 3, generator=self.generator, device=self.device) * scale
 
-    def observe(self, pose: Tensor, goal: Tensor, previous_arm: Tensor, epsilon_rad: Tensor) -> Tensor:
+    def rules_of(self, tensordict: TensorDictBase) -> Rules:
+        """The rules of the cells that rows are in."""
+        if self.layouts is None:
+            return self.rules
+        layout = tensordict["layout"][:, 0].cpu().numpy()
+        if not np.array_equal(layout, self.rules.cell.layout):
+            self.rules = self.rules.on(CellBatch(self.layouts, layout))
+        return self.rules
+
+    def observe(self, pose: Tensor, goal: Tensor, previous_arm: Tensor, epsilon_rad: Tensor, rules: Rules | None = None) -> Tensor:
         """What the supervisor sees of objects at ``pose`` (n, 3): displaced by noise, where the task has that."""
         noise = self.rules.config.noise
         if noise.observed:
             offset = self._normal(len(pose), noise.observed_mm, noise.observed_deg)
             pose = carried(pose, pose[:, :2] + offset[:, :2], offset[:, 2])
-        return observe(self.rules, self.rules.config.layout, pose, goal, previous_arm, epsilon_rad)
+        return observe(rules or self.rules, self.rules.config.layout, pose, goal, previous_arm, epsilon_rad)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         pose, goal = tensordict["achieved_goal"], tensordict["desired_goal"]
         epsilon, made = tensordict["epsilon"][:, 0], tensordict["transfers"][:, 0]
         previous, action = tensordict["previous_arm"][:, 0], tensordict["action"]
-        noise, final_noise = self._noise(), self._noise()
-        stepped = advance(self.rules, pose, goal, previous, action, made, epsilon_rad=epsilon, noise=noise, final_noise=final_noise)
+        noise, final_noise, rules = self._noise(), self._noise(), self.rules_of(tensordict)
+        stepped = advance(rules, pose, goal, previous, action, made, epsilon_rad=epsilon, noise=noise, final_noise=final_noise)
         result, terminated, truncated = stepped.result, stepped.result.terminated[:, None], stepped.truncated[:, None]
-        observation = self.observe(result.pose, goal, result.previous_arm, epsilon)
+        observation = self.observe(result.pose, goal, result.previous_arm, epsilon, rules)
+        kept = {} if self.layouts is None else {"layout": tensordict["layout"]}
         return TensorDict(
-            {
+            kept
+            | {
                 "observation": observation,
                 "achieved_goal": result.pose,
                 "desired_goal": goal,

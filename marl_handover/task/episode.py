@@ -142,10 +142,11 @@ def play(
     while len(running):
         here, there = pose, goal
         made = transfers[running]
+        here_rules = rules.of_rows(running)
         action = act(here, there, previous)
         noises = [None if noise is None else noise(len(here)) for _ in range(2)]
         stepped = advance(
-            rules, here, there, previous, action, made, epsilon_rad=epsilon_rad, noise=noises[0], final_noise=noises[1], may_wait=True
+            here_rules, here, there, previous, action, made, epsilon_rad=epsilon_rad, noise=noises[0], final_noise=noises[1], may_wait=True
         )
         result = stepped.result
         if observer is not None:

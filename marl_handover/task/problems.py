@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from marl_handover.arrays import Floats, wrap
+from marl_handover.cell.batch import CellBatch
 from marl_handover.cell.cell import Cell
 from marl_handover.errors import InvalidSetting, NotFinite, UnknownKey
 
@@ -51,8 +52,11 @@ def sample_positions(cell: Cell, count: int, generator: torch.Generator, dtype: 
         if beside:
             angle = angle + torch.asin(of_arm[arm, 7] / radius)
         points = of_arm[arm, :2] + radius[:, None] * torch.stack([angle.cos(), angle.sin()], -1)
-        owner = cell.reaches(points).to(torch.uint8).argmax(-1)
-        points = points[owner == arm][:missing]
+        reached = cell.reaches(points)
+        mine = reached.to(torch.uint8).argmax(-1) == arm
+        if cell.keep_out:
+            mine &= reached.any(-1)
+        points = points[mine][:missing]
         kept.append(points)
         missing -= len(points)
     return torch.cat([of_arm[:0, :2], *kept])
@@ -65,10 +69,39 @@ def sample_poses(cell: Cell, count: int, generator: torch.Generator, dtype: torc
     return torch.cat([positions, theta], -1)
 
 
-def sample_problems(cell: Cell, count: int, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """``count`` starts and goals, each (count, 3)."""
+def sample_problems(
+    cell: Cell | CellBatch, count: int, generator: torch.Generator, dtype: torch.dtype = torch.float64
+) -> tuple[Tensor, Tensor]:
+    """``count`` starts and goals, each (count, 3); of a batch of ``count`` cells one problem in each."""
+    if isinstance(cell, CellBatch):
+        start, goal = (_poses_in_each(cell, generator, dtype) for _ in range(2))
+        return start, goal
     poses = sample_poses(cell, 2 * count, generator, dtype)
     return poses[:count], poses[count:]
+
+
+def _poses_in_each(cells: CellBatch, generator: torch.Generator, dtype: torch.dtype) -> Tensor:
+    """A pose (n, 3) in each cell, uniform on what its arms reach; as :func:`sample_positions` draws them."""
+    device, count = generator.device, len(cells)
+    of_arm = torch.as_tensor(cells.pool.arms[cells.layout], dtype=dtype, device=device)
+    square, span = of_arm[..., 3] ** 2, of_arm[..., 4] ** 2 - of_arm[..., 3] ** 2
+    shares = (span * (of_arm[..., 6] - of_arm[..., 5])).cumsum(-1)
+    shares = shares / shares[:, -1:]
+    positions = torch.zeros(count, 2, dtype=dtype, device=device)
+    missing = torch.arange(count, device=device)
+    while len(missing):
+        uniform = torch.rand(len(missing), 3, generator=generator, dtype=dtype, device=device)
+        arm = torch.searchsorted(shares[missing], uniform[:, :1].contiguous(), right=True)[:, 0]
+        base = of_arm[missing, arm]
+        radius = (square[missing, arm] + uniform[:, 1] * span[missing, arm]).sqrt()
+        angle = base[:, 2] + base[:, 5] + uniform[:, 2] * (base[:, 6] - base[:, 5])
+        points = base[:, :2] + radius[:, None] * torch.stack([angle.cos(), angle.sin()], -1)
+        reached = cells.take(missing).reaches(points)
+        kept = (reached.to(torch.uint8).argmax(-1) == arm) & reached.any(-1)
+        positions[missing[kept]] = points[kept]
+        missing = missing[~kept]
+    theta = torch.rand(count, 1, generator=generator, dtype=dtype, device=device) * (2 * math.pi) - math.pi
+    return torch.cat([positions, theta], -1)
 
 
 class ProblemSource:

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import copy
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from marl_handover.arrays import Array, length, namespace, one_where, select, wrap
 from marl_handover.cell.arm import REACH_TOLERANCE_MM
+from marl_handover.cell.batch import CellBatch
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import NO_ARM
 from marl_handover.config import TaskConfig
@@ -105,14 +107,14 @@ def carried(pose: Array, target_mm: Array, turn_rad: Array) -> Array:
 
 
 class Rules:
-    """The decision problem of one cell (method section 3).
+    """The decision problem of one cell, or of a batch of cells with a row each (method section 3).
 
     :meth:`step` is a decision from end to end. Who executes transfers elsewhere composes it from the same pieces: :meth:`decode`,
     :meth:`transfer`, then :meth:`judge` (architecture B) or :meth:`external` and :meth:`external_verdict` (A).
     ``physical`` says that placements are measured, though the task's settings have no noise.
     """
 
-    def __init__(self, cell: Cell, config: TaskConfig, motion_cost: MotionCost = straight_line_mm, *, physical: bool = False) -> None:
+    def __init__(self, cell: Any, config: TaskConfig, motion_cost: MotionCost = straight_line_mm, *, physical: bool = False) -> None:
         config.validate()
         self.cell = cell
         self.config = config
@@ -124,6 +126,16 @@ class Rules:
             self.action_size = 2 * cell.num_arms + 3
 
     action_size = 4  # numbers in an action of a pair; N arms: final, a score an arm, a score a receiver, alpha, beta
+
+    def on(self, cell: Cell | CellBatch) -> Rules:
+        """The same rules for another cell, or batch of cells, with as many arms."""
+        other = copy(self)
+        other.cell = cell
+        return other
+
+    def of_rows(self, rows: Array) -> Rules:
+        """The rules of some rows (by number, or a mask) of a batch of cells; of one cell itself."""
+        return self.on(self.cell.take(rows)) if isinstance(self.cell, CellBatch) else self
 
     @property
     def external_finish(self) -> bool:
