@@ -103,9 +103,9 @@ def write(axes: Any, place_mm: Any, text: str, **style: Any) -> None:
 def hand_over_angle() -> Figure:
     """What the angle is; that places on one arc see the bases at the same angle; the curves over the shared space."""
     cell, half = pair(360.0, PAPER_RING, 90.0, 90.0), (190.0, 215.0)
-    figure = Figure(figsize=(10.5, 4.4), layout="constrained")
+    figure = Figure(figsize=(9.0, 3.9), layout="constrained")
     panels = figure.subplots(1, 3)
-    titles = ("The angle at which p sees the bases", "The same angle all along an arc of a circle", "What the shared space offers")
+    titles = ("The angle at which p sees the bases", "The same all along an arc of a circle", "Curves over the shared space")
     for axes, title in zip(panels, titles, strict=True):
         axes.set_title(title, fontsize=10)
         window(axes, half)
@@ -120,7 +120,7 @@ def hand_over_angle() -> Figure:
         arrow = {"arrowstyle": "-|>", "color": arm_colour(arm), "linewidth": 2.2, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 14}
         panels[0].annotate("", xy=tip, xytext=place, arrowprops=arrow, zorder=8)
         write(panels[0], tip + (-8, -14 if arm == 0 else 14), f"$\\psi_{name}$", color=arm_colour(arm), fontsize=12)
-    write(panels[0], place + (70, -4), f"γ = {gamma:.0f}°", fontsize=11)
+    write(panels[0], place + (86, -2), f"γ = {gamma:.0f}°", fontsize=11)
     write(panels[0], (95, 180), "L's hand at p\npoints away from L", color=arm_colour(0), fontsize=8)
     write(panels[0], (95, -180), "R's hand at p\npoints away from R", color=arm_colour(1), fontsize=8)
     centre = 180.0 / math.tan(math.radians(gamma))
@@ -164,16 +164,16 @@ def _sight(axes: Any, cell: Cell, place: np.ndarray, thick: bool = False) -> Non
 def offered_angles() -> Figure:
     """Curves of equal angle and the set Gamma: all of it, with a disc in mid-curve, with one across, with a yaw limit."""
     cells = {
-        "No obstacle": pair(440.0, AL5A_RING, 95.0, 95.0),
-        "A disc in mid-curve:\ncurves in two pieces, Γ as before": pair(440.0, AL5A_RING, 95.0, 95.0, [(60.0, 0.0, 12.0)]),
-        "Discs across the whole width:\na gap in Γ": pair(440.0, AL5A_RING, 95.0, 95.0, [(75.0, 45.0, 25.0), (75.0, -45.0, 25.0)]),
-        "L turns by ±25° only:\nboth ends are cut off": pair(440.0, AL5A_RING, 25.0, 95.0),
+        "Nothing in the way": pair(440.0, AL5A_RING, 95.0, 95.0),
+        "A disc in mid-curve:\nΓ as before": pair(440.0, AL5A_RING, 95.0, 95.0, [(60.0, 0.0, 12.0)]),
+        "Discs from side to side:\na gap in Γ": pair(440.0, AL5A_RING, 95.0, 95.0, [(75.0, 45.0, 25.0), (75.0, -45.0, 25.0)]),
+        "L turns by ±25° only:\nΓ ends earlier": pair(440.0, AL5A_RING, 25.0, 95.0),
     }
-    figure = Figure(figsize=(11, 4.9), layout="constrained")
+    figure = Figure(figsize=(9.2, 4.2), layout="constrained")
     tables, dials = figure.add_gridspec(2, 4, height_ratios=(1.15, 1)), []
     for column, (title, cell) in enumerate(cells.items()):
         axes = figure.add_subplot(tables[0, column])
-        half = (245.0, 150.0)
+        half = (235.0, 115.0)
         shade(axes, cell, half)
         window(axes, half)
         for value in range(92, 270, 8):
@@ -217,7 +217,7 @@ def charts() -> Figure:
         "Bases inside each other's ring, 180 mm apart": (pair(180.0, PAPER_RING, 120.0, 120.0), (255.0, 105.0)),
         "With a disc, in the cell al5a's rings": (pair(440.0, AL5A_RING, 95.0, 95.0, [(60.0, 0.0, 12.0)]), (255.0, 105.0)),
     }
-    figure = Figure(figsize=(10, 5.4), layout="constrained")
+    figure = Figure(figsize=(8.4, 4.6), layout="constrained")
     for axes, (title, (cell, half)) in zip(figure.subplots(2, 2).reshape(-1), panels.items(), strict=True):
         shade(axes, cell, half)
         window(axes, half)
@@ -251,7 +251,7 @@ def adding_up() -> Figure:
     across = float(goal[2] - start[2] + psi[0] - goal_psi[1])
     rows = [(two, 1, across), (three, 1, across), (two, 0, math.pi), (three, 0, math.pi)]
     names = [f"{count} arms,\n{way}" for way in ("A to B", "A back to A") for count in ("two", "three")]
-    figure = Figure(figsize=(9.4, 8.2), layout="constrained")
+    figure = Figure(figsize=(7.6, 6.6), layout="constrained")
     for row, ((cell, last, needed), name) in enumerate(zip(rows, names, strict=True)):
         planner, solved = planner_of(cell), False
         for count in range(1, 6):
