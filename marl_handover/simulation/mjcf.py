@@ -205,7 +205,7 @@ class _Writer:
         self._add(visual, "headlight", ambient="0.45 0.45 0.45", diffuse="0.25 0.25 0.25", specular="0 0 0")
         self._add(visual, "quality", shadowsize="4096", offsamples="8")
         away = np.multiply(-1.0, LIGHT)
-        light = {"type": "directional", "pos": _numbers(LIGHT), "dir": _numbers(away), "diffuse": "0.4 0.4 0.4", "specular": "0.1 0.1 0.1"}
+        light = {"directional": "true", "pos": _numbers(LIGHT), "dir": _numbers(away), "diffuse": "0.4 0.4 0.4", "specular": "0.1 0.1 0.1"}
         self._add(self.world, "light", castshadow="true", **light)
         for number, strip in enumerate(look.strips):
             name, count = f"strip{number}", len(strip.one_mm)

@@ -6,6 +6,7 @@ themselves.
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 import sys
@@ -333,7 +334,9 @@ def gl_context() -> Any:
     usual = {"linux": next((name for name, library in _LIBRARIES.items() if find_library(library)), ""), "darwin": "cgl"}
     name = os.environ.get("MUJOCO_GL") or usual.get(sys.platform, "glfw")
     try:
-        return importlib.import_module(f"mujoco.{name}").GLContext(64, 64)
+        context = importlib.import_module(f"mujoco.{name}").GLContext(64, 64)
+        atexit.register(context.free)  # while its library is still there
+        return context
     except Exception:  # a library that is there and does not work fails in many ways
         return None
 
