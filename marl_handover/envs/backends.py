@@ -196,7 +196,7 @@ def make_backend(name: str, model: CellModel, task: TaskConfig, motion: MotionCo
     """A backend by name; ``noisy`` takes the task's noise, if there is any.
 
     Args:
-        name: ``kinematic``, ``noisy``, ``bullet``, ``twin``, ``hardware``, or one that a plugin registered.
+        name: ``kinematic``, ``noisy``, ``bullet``, ``mujoco``, ``twin``, ``hardware``, or one that a plugin registered.
         model: the cell.
         task: the task's settings.
         motion: how the arms move.

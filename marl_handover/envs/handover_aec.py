@@ -76,7 +76,7 @@ class HandoverEnv(AECEnv):
     On arms that are not exact, hand-overs keep to ``LoopConfig.chart_inset`` of the chart, as in the closed loop.
 
     Args:
-        backend: ``kinematic``, ``noisy``, ``bullet``, or one of your own.
+        backend: ``kinematic``, ``noisy``, ``bullet``, ``mujoco``, or one of your own.
         cell: a shipped cell's name, a YAML path, settings, or a cell that is built already.
         task: the task's settings. Its noise is that of the ``noisy`` backend; the others have their own or none.
         motion: how the arms move.

@@ -13,6 +13,7 @@ from marl_handover.config import (
     EXPLORATIONS,
     HINDSIGHT,
     LAYOUTS,
+    PHYSICS,
     CellConfig,
     CentralisedConfig,
     DecentralisedConfig,
@@ -217,7 +218,7 @@ class TrainConfig:
     centralised: CentralisedConfig = field(default_factory=CentralisedConfig)
     decentralised: DecentralisedConfig = field(default_factory=DecentralisedConfig)
     source: str = chosen("batched", SOURCES)  # of transitions: batched (the rule book itself), or aec (the PettingZoo environment)
-    backend: str = chosen("kinematic", BACKENDS.without("twin", "hardware"))  # of source=aec: kinematic, noisy or bullet
+    backend: str = chosen("kinematic", BACKENDS.without("twin", "hardware"))  # of source=aec: kinematic, noisy, bullet or mujoco
     executor: str = chosen("direct", EXECUTORS)  # of source=aec: direct (straight in joint space), or optimised (collision-free)
     collector: str = chosen("local", COLLECTORS)  # of source=aec: local, multiprocess or ray
     workers: int = bounded(2, 1, 256)  # of collector=multiprocess and ray
@@ -340,5 +341,5 @@ class TrainConfig:
         noise = self.task.noise
         if noise.observed or (self.backend != "noisy" and (noise.position_mm > 0 or noise.yaw_deg > 0)):
             raise InvalidSetting("task.noise", noise, "none with source=aec, but for that of placements with backend=noisy")
-        if self.backend == "bullet" and self.executor == "direct":
-            raise InvalidSetting("executor", self.executor, "optimised with backend=bullet, where arms touch things")
+        if self.backend in PHYSICS and self.executor == "direct":
+            raise InvalidSetting("executor", self.executor, f"optimised with backend={self.backend}, where arms touch things")

@@ -218,6 +218,7 @@ def test_a_run_learns_from_it_stops_and_goes_on(small, tmp_path, table):
         (["source=aec", "algorithm=ppo"], "source"),
         (["source=aec", "variant=decentralised"], "source"),
         (["source=aec", "backend=bullet"], "executor"),
+        (["source=aec", "backend=mujoco"], "executor"),
         (["source=aec", "backend=robot"], "backend"),
         (["source=aec", "executor=magic"], "executor"),
         (["source=aec", "collector=threads"], "collector"),
