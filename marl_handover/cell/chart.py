@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -22,6 +22,7 @@ from marl_handover.cell.angle_kernels import PAIR_SIZE, chart_coordinates, middl
 from marl_handover.cell.arm import Arm, Disc
 from marl_handover.errors import InvalidSetting, NoSharedSpace
 from marl_handover.geometry.se2 import SE2
+from marl_handover.progress import working
 
 
 class Arc(NamedTuple):
@@ -161,6 +162,7 @@ class EdgeTable:
     """
 
     def __init__(self, pairs: Floats, discs: Sequence[Floats], arcs: Sequence[Floats], inset: float) -> None:
+        _compile()
         self.pairs, self.inset = np.ascontiguousarray(pairs), float(inset)
         self.discs, self.n_discs = _padded(discs, 3)
         self.arcs, self.n_arcs = _padded(arcs, 2)
@@ -193,6 +195,17 @@ class EdgeTable:
         rows = _rows(edge, np.int64, gamma_rad.shape), _rows(gamma_rad) - math.pi
         middles(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, *rows, out.reshape(-1, 2))
         return _like(out, gamma_rad)
+
+
+@cache
+def _compile() -> None:
+    """Call what is compiled on first use; where that takes long, say so on stderr."""
+    with working("compiling the charts; once, they are cached"):
+        row, discs = np.array([300.0, 150.0, 230.0, 150.0, 230.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0]), np.empty((0, 3))
+        arcs, edge, zero, one = angle_arcs(row, discs)[None], np.zeros(1, np.int64), np.zeros(1), np.ones(1, np.int64)
+        places(row[None], discs[None], edge, arcs, one, 1.0, edge, zero, zero, np.empty((1, 2)))
+        chart_coordinates(row[None], discs[None], edge, arcs, one, 1.0, edge, np.zeros((1, 2)), np.empty((1, 2)))
+        middles(row[None], discs[None], edge, arcs, one, edge, zero, np.empty((1, 2)))
 
 
 def _padded(rows: Sequence[Floats], width: int) -> tuple[Floats, NDArray[np.int64]]:
@@ -306,6 +319,7 @@ class AngleChart:
 
     @cached_property
     def _arcs(self) -> Floats:
+        _compile()
         return np.asarray(angle_arcs(self._row, self._discs))
 
     @cached_property

@@ -10,14 +10,15 @@ only and is computed once; of ways whose sums others have too, only what adds so
 from __future__ import annotations
 
 import math
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from marl_handover.arrays import Array, namespace, one_where
-from marl_handover.errors import OutOfReach
+from marl_handover.errors import BlockedPlace, OutOfReach
+from marl_handover.progress import working
 from marl_handover.task.plan_kernels import all_ways, shortest
 from marl_handover.task.rules import Rules
 
@@ -65,6 +66,7 @@ class ExactPlanner:
         hops.sort(key=lambda hop: hop[:3])
         start, end, arc_number, least, most = (np.array(column) for column in zip(*hops, strict=True))
         self._hops = end, arc_number
+        _compile()
         found = all_ways(rules.cell.num_arms, start, end, least.astype(float), most.astype(float), rules.config.max_steps, self._period)
         self._parent, self._hop, self._low, self._high, self._start = found
         self._tables: dict[Any, Array] = {}
@@ -122,7 +124,7 @@ class ExactPlanner:
         for what, where in (("start", pose), ("goal", goal)):
             try:
                 self.rules.cell.require_reached(what, where)
-            except OutOfReach as error:
+            except (BlockedPlace, OutOfReach) as error:
                 return str(error)
         if int(self.plan(pose, goal, epsilon_rad).transfers):
             return ""
@@ -202,6 +204,16 @@ class ExactPlanner:
         else:
             scores = [xp.where(who == arm, one, -one) for who in (giver, receiver) for arm in range(cell.num_arms)]
         return xp.concat([xp.stack([final, *scores], -1), xp.clip(chart, -1.0, 1.0)], -1)
+
+
+@cache
+def _compile() -> None:
+    """Call what is compiled on first use; where that takes long, say so on stderr."""
+    with working("compiling the planner; once, it is cached"):
+        ends, angles = np.array([1, 0]), np.array([2.0, -4.0])
+        *_, low, high, start = all_ways(2, ends[::-1].copy(), ends, angles, angles + 2.0, 2, 2 * math.pi)
+        reached, yaw, turn = np.ones((1, 2), bool), np.zeros((1, 2)), np.zeros(1)
+        shortest(reached, reached, yaw, yaw, turn, turn, low, high, start, 2 * math.pi, np.empty((1, 3), np.int64), np.empty((1, 2)))
 
 
 def _numpy(values: Any, dtype: type) -> Any:
