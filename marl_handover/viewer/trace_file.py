@@ -178,6 +178,8 @@ def _step(row: dict[str, Any], recorded: Recorded | None) -> Step:
     epsilon_rad = float(row["epsilon_rad"])
     if not math.isfinite(epsilon_rad):
         raise ValueError("epsilon_rad is not finite")
+    if row["arm"] not in ARM_LETTERS:
+        raise ValueError(f"its arm is {str(row['arm'])[:40]!r}, and pages show a pair of arms, {' and '.join(ARM_LETTERS)}")
     arm, place = ARM_LETTERS.index(row["arm"]), _numbers(row["place"], (2,))
     return Step(state, goal, arm, row["final"], place, next_state, outcome or "", epsilon_rad, trouble, recorded)
 
