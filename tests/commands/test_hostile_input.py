@@ -69,13 +69,23 @@ LINES = [
     (["calibrate", "what=sheets", "hardware=twin", "calibration=c", "hand_markers.ids=[[1,2],[3]]"], "hand_markers.ids"),
     (["calibrate", "what=sheets", "hardware=twin", "calibration=c", "target.goal_mm=1e9"], "target.goal_mm"),
     (["simulate", "cell.block.pin_diameter_mm=-1"], "cell.block.pin_diameter_mm"),
-    (["simulate", "cell.urdf=mesh.urdf", "seed=1", "progress=false"], "every mesh it names"),
     (["workspace", "out=~no-such-user-here/x"], "no such home"),
 ]
 
 
 @pytest.mark.parametrize(("line", "words"), LINES, ids=[" ".join(argument[:40] for argument in line) for line, _ in LINES])
 def test_one_short_line_and_exit_2(tmp_path, monkeypatch, capsys, line, words):
+    assert_refused(tmp_path, monkeypatch, capsys, line, words)
+
+
+def test_a_mesh_that_is_none_is_refused_by_the_engine_that_reads_it(tmp_path, monkeypatch, capsys):
+    """PyBullet draws a file's meshes; MuJoCo takes the shapes that were read before, so nothing is amiss there."""
+    pytest.importorskip("pybullet")
+    line = ["simulate", "engine=bullet", "cell.urdf=mesh.urdf", "seed=1", "progress=false"]
+    assert_refused(tmp_path, monkeypatch, capsys, line, "every mesh it names")
+
+
+def assert_refused(tmp_path, monkeypatch, capsys, line, words):
     monkeypatch.chdir(tmp_path)
     for name, text in FILES.items():
         Path(name).write_text(text)
