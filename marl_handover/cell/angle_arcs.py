@@ -1,4 +1,4 @@
-"""The hand-over angles that two arms have in common, compiled: which intervals of eta have places; arrays as in ``angle_kernels``."""
+"""The hand-over angles that two arms have in common, compiled: which intervals of eta have places; arrays as in ``fibres``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
-from marl_handover.cell.angle_kernels import Floats, Ints, fibre, in_frame, is_shared, length, seen, split, wrapped
+from marl_handover.cell.angle_kernels import in_frame
 from marl_handover.cell.arm import REACH_TOLERANCE_MM
+from marl_handover.cell.fibres import Floats, Ints, fibre, is_shared, length, seen, split, wrapped
 from marl_handover.compiled import compiled
 
 TANGENT_SAMPLES = 180

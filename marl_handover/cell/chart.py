@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from marl_handover.arrays import Array, Floats, namespace
 from marl_handover.cell.angle_arcs import angle_arcs, pair_row
-from marl_handover.cell.angle_kernels import PAIR_SIZE, chart_coordinates, middles, place_slopes, places
+from marl_handover.cell.angle_kernels import chart_coordinates, middles, place_slopes, places
 from marl_handover.cell.arm import Arm, Disc
+from marl_handover.cell.fibres import PAIR_SIZE
 from marl_handover.errors import InvalidSetting, NoSharedSpace
 from marl_handover.geometry.se2 import SE2
 from marl_handover.progress import working
@@ -152,7 +153,7 @@ class PaperChart:
 
 
 class EdgeTable:
-    """What pairs of arms share, one edge a row, for the compiled charts; see :mod:`marl_handover.cell.angle_kernels`.
+    """What pairs of arms share, one edge a row, for the compiled charts; see :mod:`marl_handover.cell.fibres`.
 
     Attributes:
         pairs: (E, 15) geometry of each pair of arms.
