@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marl_handover.arrays import Array, namespace, one_where
-from marl_handover.errors import BlockedPlace, OutOfReach
+from marl_handover.errors import BlockedPlace, OutOfReach, counted
 from marl_handover.progress import working
 from marl_handover.task.plan_kernels import all_ways, shortest
 from marl_handover.task.rules import Rules
@@ -131,7 +131,7 @@ class ExactPlanner:
         epsilon_deg = math.degrees(self.rules.epsilon_rad if epsilon_rad is None else epsilon_rad)
         turn_deg = math.degrees(float(goal[2]) - float(pose[2]))
         most = self.rules.config.max_steps
-        return f"no sequence of up to {most} transfers turns the object by {turn_deg:.4g} deg to within {epsilon_deg:g} deg"
+        return f"no sequence of up to {counted(most, 'transfer')} turns the object by {turn_deg:.4g} deg to within {epsilon_deg:g} deg"
 
     def hand_over_mm(self, plan: Plan, index: int) -> Array:
         """Position (..., 2) in mm of hand-over number ``index`` (0 is the first), in the middle of those with the angle that it is to have.
