@@ -60,7 +60,7 @@ def test_an_environment_that_nobody_holds_lets_its_world_go(engine):
 
 
 def test_fifty_environments_leave_no_memory_behind(engine):
-    """In a process of its own: what other tests keep is not counted. Ten more than forty before cost less than 8 MB."""
+    """In a process of its own: what other tests keep is not counted. Medians of ten: drivers give memory of pictures back late."""
     code = f"""
 import gc, os
 from marl_handover.cell import build_cell, cell_config
@@ -78,14 +78,12 @@ for number in range(50):
         env.close()
     del env
     seen.append(used_mb())
-print(seen[39] - seen[9], seen[49] - seen[39])
+print(sorted(seen[40:])[5] - sorted(seen[10:20])[5])
 """
     if not os.path.exists("/proc/self/statm"):
         pytest.skip("memory is read from /proc")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    first, last = map(float, done.stdout.split()[-2:])
-    assert first < 15
-    assert last < 8
+    assert float(done.stdout.split()[-1]) < 8
 
 
 COPIES = {"deepcopy": copy.deepcopy, "pickle": pickle.dumps, "cloudpickle": cloudpickle.dumps}
