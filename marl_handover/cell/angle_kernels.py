@@ -132,7 +132,12 @@ def _along(pieces: Floats, count: int, inset: float, side: int, a: float, e: flo
                 middle = (begin + end) / 2
                 at = reached + abs(middle - begin) + (a - middle) / inset * (1.0 if end > begin else -1.0)
             else:
-                at = reached + (0.0 if abs(own - low) < abs(own - high) else size)
+                # Not quite at the end where another piece begins: rounding would put the place there.
+                off = min(size / 2, max(1e-9 * total, min(beside, 1e-7 * total)))
+                if abs(own - low) < abs(own - high):
+                    at = reached + (0.0 if number == 0 else off)
+                else:
+                    at = reached + (size if number == count - 1 else size - off)
         reached += size
     return 1.0 - 2.0 * at / total if total > 0.0 else 0.0
 

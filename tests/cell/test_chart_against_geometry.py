@@ -182,6 +182,5 @@ def test_the_chart_is_a_bijection_for_a_thousand_pairs(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="where a curve is two single points, a place rounded to float32 may be taken for the other one (1 pair in 200)")
 def test_the_chart_is_a_bijection_for_a_thousand_pairs_in_float32():
     judge(21, 1000, in_float32)
