@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.arrays import Array, Floats, as_kind, kind_of, namespace
-from marl_handover.cell.angle_arcs import layout_edges
 from marl_handover.cell.arm import REACH_TOLERANCE_MM
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.chart import EdgeTable
@@ -257,6 +256,8 @@ def _random_disc(arms: Floats, config: LayoutConfig, generator: np.random.Genera
 
 def _edges(arms: Floats, discs: Floats) -> tuple[NDArray[np.int64], Floats, Floats, list[Floats]]:
     """The edge of each two arms (N, N), and of each edge its geometry, discs and arcs."""
+    from marl_handover.cell.angle_arcs import layout_edges  # here: one cell with the paper's chart needs no compiler
+
     most = len(arms) * (len(arms) - 1) // 2
     number, pairs, there = np.empty((len(arms), len(arms)), np.int64), np.empty((most, 15)), np.empty((most, len(discs), 3))
     arcs, n_arcs = np.empty((most, _MOST_ARCS, 2)), np.zeros(most, np.int64)

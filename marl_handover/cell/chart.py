@@ -11,16 +11,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
+from types import SimpleNamespace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.arrays import Array, Floats, namespace
-from marl_handover.cell.angle_arcs import angle_arcs, pair_row
-from marl_handover.cell.angle_kernels import chart_coordinates, middles, place_slopes, places
 from marl_handover.cell.arm import Arm, Disc
-from marl_handover.cell.fibres import PAIR_SIZE
 from marl_handover.errors import InvalidSetting, NoSharedSpace
 from marl_handover.geometry.se2 import SE2
 from marl_handover.progress import working
@@ -163,7 +161,6 @@ class EdgeTable:
     """
 
     def __init__(self, pairs: Floats, discs: Sequence[Floats], arcs: Sequence[Floats], inset: float) -> None:
-        _compile()
         self.pairs, self.inset = np.ascontiguousarray(pairs), float(inset)
         self.discs, self.n_discs = _padded(discs, 3)
         self.arcs, self.n_arcs = _padded(arcs, 2)
@@ -172,12 +169,12 @@ class EdgeTable:
         """World places (..., 2) in mm of chart coordinates (...) on edges (...), with a gradient; NaN where an edge is negative."""
         out = np.empty((*alpha.shape, 2))
         rows = _rows(edge, np.int64, alpha.shape), _rows(alpha), _rows(beta)
-        places(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, self.inset, *rows, out.reshape(-1, 2))
+        _compiled().places(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, self.inset, *rows, out.reshape(-1, 2))
         place = _like(out, alpha)
         if not (getattr(alpha, "requires_grad", False) or getattr(beta, "requires_grad", False)):
             return place
         slopes = np.empty((*alpha.shape, 2, 2))
-        place_slopes(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, self.inset, *rows, slopes.reshape(-1, 2, 2))
+        _compiled().place_slopes(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, self.inset, *rows, slopes.reshape(-1, 2, 2))
         chart = namespace(alpha).stack([alpha, beta], -1)
         return place + (_like(slopes, alpha) * (chart - chart.detach())[..., None, :]).sum(-1)  # adds 0, and the gradient
 
@@ -186,7 +183,7 @@ class EdgeTable:
         shape = position_mm.shape[:-1]
         out, at = np.empty((*shape, 2)), _rows(position_mm).reshape(-1, 2)
         rows = _rows(edge, np.int64, shape), at
-        chart_coordinates(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, self.inset, *rows, out.reshape(-1, 2))
+        _compiled().chart_coordinates(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, self.inset, *rows, out.reshape(-1, 2))
         found = _like(out, position_mm)
         return found[..., 0], found[..., 1]
 
@@ -194,19 +191,23 @@ class EdgeTable:
         """World places (..., 2) in the middle of the longest piece of those that have the hand-over angle ``gamma_rad`` (...)."""
         out = np.empty((*gamma_rad.shape, 2))
         rows = _rows(edge, np.int64, gamma_rad.shape), _rows(gamma_rad) - math.pi
-        middles(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, *rows, out.reshape(-1, 2))
+        _compiled().middles(self.pairs, self.discs, self.n_discs, self.arcs, self.n_arcs, *rows, out.reshape(-1, 2))
         return _like(out, gamma_rad)
 
 
 @cache
-def _compile() -> None:
-    """Call what is compiled on first use; where that takes long, say so on stderr."""
+def _compiled() -> SimpleNamespace:
+    """The compiled functions, which the paper's chart does without; where compiling them takes long, stderr is told."""
+    from marl_handover.cell import angle_arcs, angle_kernels, fibres
+
+    found = SimpleNamespace(**vars(fibres) | vars(angle_kernels) | vars(angle_arcs))
     with working("compiling the charts; once, they are cached"):
         row, discs = np.array([300.0, 150.0, 230.0, 150.0, 230.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0]), np.empty((0, 3))
-        arcs, edge, zero, one = angle_arcs(row, discs)[None], np.zeros(1, np.int64), np.zeros(1), np.ones(1, np.int64)
-        places(row[None], discs[None], edge, arcs, one, 1.0, edge, zero, zero, np.empty((1, 2)))
-        chart_coordinates(row[None], discs[None], edge, arcs, one, 1.0, edge, np.zeros((1, 2)), np.empty((1, 2)))
-        middles(row[None], discs[None], edge, arcs, one, edge, zero, np.empty((1, 2)))
+        arcs, edge, zero, one = found.angle_arcs(row, discs)[None], np.zeros(1, np.int64), np.zeros(1), np.ones(1, np.int64)
+        found.places(row[None], discs[None], edge, arcs, one, 1.0, edge, zero, zero, np.empty((1, 2)))
+        found.chart_coordinates(row[None], discs[None], edge, arcs, one, 1.0, edge, np.zeros((1, 2)), np.empty((1, 2)))
+        found.middles(row[None], discs[None], edge, arcs, one, edge, zero, np.empty((1, 2)))
+    return found
 
 
 def _padded(rows: Sequence[Floats], width: int) -> tuple[Floats, NDArray[np.int64]]:
@@ -300,15 +301,15 @@ class AngleChart:
     @property
     def row(self) -> tuple[Floats, Floats, Floats]:
         """The row of an :class:`EdgeTable` whose places are in the world: geometry, discs, arcs."""
-        row = np.empty(PAIR_SIZE)
-        pair_row(np.stack([arm_row(self.first), arm_row(self.second)]), 0, 1, row)
+        row = np.empty(_compiled().PAIR_SIZE)
+        _compiled().pair_row(np.stack([arm_row(self.first), arm_row(self.second)]), 0, 1, row)
         return row, self._discs, self._arcs
 
     @cached_property
     def _row(self) -> Floats:
         """The geometry in the pair's own frame."""
-        row = np.empty(PAIR_SIZE)
-        pair_row(np.stack([arm_row(self.first), arm_row(self.second)]), 0, 1, row)
+        row = np.empty(_compiled().PAIR_SIZE)
+        _compiled().pair_row(np.stack([arm_row(self.first), arm_row(self.second)]), 0, 1, row)
         row[11:] = 0.0, 0.0, 1.0, 0.0
         return row
 
@@ -320,8 +321,7 @@ class AngleChart:
 
     @cached_property
     def _arcs(self) -> Floats:
-        _compile()
-        return np.asarray(angle_arcs(self._row, self._discs))
+        return np.asarray(_compiled().angle_arcs(self._row, self._discs))
 
     @cached_property
     def _table(self) -> EdgeTable:
