@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from marl_handover.arrays import Array, namespace, one_where
+from marl_handover.arrays import Array, as_kind, namespace, one_where
 from marl_handover.errors import BlockedPlace, OutOfReach, counted
 from marl_handover.progress import working
 from marl_handover.task.plan_kernels import all_ways, shortest
@@ -161,10 +161,11 @@ class ExactPlanner:
         for number, arcs in enumerate(self._arcs.values()):
             for arc, each in enumerate(arcs):
                 rows[:, number, arc] = each.low_rad, each.back_low_rad, each.width_rad
-        return self._as_kind("edge", self.rules.cell.graph.number, like), *self._as_kind("arcs", rows, like)
+        lows, back_lows, widths = as_kind(rows, like)
+        return self._as_kind("edge", self.rules.cell.graph.number, like), lows, back_lows, widths
 
     def _as_kind(self, name: str, table: Any, like: Array) -> Any:
-        """A table as numpy, or as torch on the device of ``like``; made once."""
+        """A table of whole numbers as numpy, or as torch on the device of ``like``; made once."""
         if isinstance(like, (np.ndarray, np.generic)):
             return table
         key = (name, like.device)
