@@ -60,7 +60,10 @@ def test_an_environment_that_nobody_holds_lets_its_world_go(engine):
 
 
 def test_fifty_environments_leave_no_memory_behind(engine):
-    """In a process of its own: what other tests keep is not counted. Medians of ten: drivers give memory of pictures back late."""
+    """In a process of its own: what other tests keep is not counted.
+
+    What two of them add, one of which nobody closes: the median, as a drawing library takes 64 MiB at a time and gives it back late.
+    """
     code = f"""
 import gc, os
 from marl_handover.cell import build_cell, cell_config
@@ -78,7 +81,8 @@ for number in range(50):
         env.close()
     del env
     seen.append(used_mb())
-print(sorted(seen[40:])[5] - sorted(seen[10:20])[5])
+added = sorted(later - before for before, later in zip(seen[10:], seen[12:]))
+print(20 * added[len(added) // 2])
 """
     if not os.path.exists("/proc/self/statm"):
         pytest.skip("memory is read from /proc")
