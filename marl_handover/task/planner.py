@@ -58,6 +58,11 @@ class ExactPlanner:
         self.rules = rules
         self._period = 2 * math.pi / rules.config.symmetry_order
         self._arcs = {pair: space.chart.arcs for pair, space in rules.cell.graph.edges.items()}
+        self._tables: dict[Any, Array] = {}
+
+    @cached_property
+    def _found(self) -> tuple[Any, Any]:
+        """What :func:`all_ways` finds, and the receiver and the arc of each hop."""
         hops = []
         for (i, j), arcs in self._arcs.items():
             for number, arc in enumerate(arcs):
@@ -65,11 +70,10 @@ class ExactPlanner:
                 hops += [(i, j, number, low, high), (j, i, number, -high, -low)]
         hops.sort(key=lambda hop: hop[:3])
         start, end, arc_number, least, most = (np.array(column) for column in zip(*hops, strict=True))
-        self._hops = end, arc_number
         _compile()
-        found = all_ways(rules.cell.num_arms, start, end, least.astype(float), most.astype(float), rules.config.max_steps, self._period)
-        self._parent, self._hop, self._low, self._high, self._start = found
-        self._tables: dict[Any, Array] = {}
+        rules, period = self.rules, self._period
+        found = all_ways(rules.cell.num_arms, start, end, least.astype(float), most.astype(float), rules.config.max_steps, period)
+        return found, (end, arc_number)
 
     @cached_property
     def walks(self) -> list[Walk]:
@@ -80,8 +84,8 @@ class ExactPlanner:
     def _ways(self) -> list[tuple[Walk, tuple[int, ...]]]:
         """Arms, and the arc of each hand-over, of all ways."""
         found: list[tuple[Walk, tuple[int, ...]]] = []
-        end, arc_number = self._hops
-        for parent, hop in zip(self._parent.tolist(), self._hop.tolist(), strict=True):
+        (parents, hops, *_), (end, arc_number) = self._found
+        for parent, hop in zip(parents.tolist(), hops.tolist(), strict=True):
             if parent < 0:
                 found.append(((len(found),), ()))
             else:
@@ -111,7 +115,8 @@ class ExactPlanner:
         psi, goal_psi = (_numpy(cell.gripper_yaw(each), float).reshape(-1, count) for each in (yaw, goal_yaw))
         turns = _numpy(turn, float).reshape(-1)
         epsilons = np.broadcast_to(_numpy(epsilon, float).reshape(shape if np.ndim(epsilon) else ()), shape).reshape(-1).copy()
-        ways = self._low, self._high, self._start, self._period
+        _, _, low, high, start = self._found[0]
+        ways = low, high, start, self._period
         shortest(starts, goals, psi, goal_psi, turns, epsilons, *ways, out.reshape(-1, 3), fit.reshape(-1, 2))
         if isinstance(pose, (np.ndarray, np.generic)):
             return Plan(out[..., 0], out[..., 1], out[..., 2], *fit.astype(pose.dtype, copy=False).transpose(-1, *range(len(shape))))
