@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence, Sized
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,9 +132,9 @@ class CellBatch(Sectors):
     def __len__(self) -> int:
         return len(self.layout)
 
-    def take(self, rows: Array) -> CellBatch:
+    def take(self, rows: Array) -> Self:
         """The cells of some rows, by number or by a mask (n,)."""
-        return CellBatch(self.pool, self.layout[rows.cpu().numpy() if hasattr(rows, "cpu") else rows])
+        return type(self)(self.pool, self.layout[rows.cpu().numpy() if hasattr(rows, "cpu") else rows])
 
     @property
     def num_arms(self) -> int:

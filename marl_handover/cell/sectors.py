@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sized
+from typing import Self
 
 from marl_handover.arrays import Array, namespace, wrap
 from marl_handover.cell.arm import REACH_TOLERANCE_MM
@@ -36,6 +37,10 @@ class Sectors(ABC):
 
         Of a batch of cells (cells, num_arms, num_arms, K).
         """
+
+    def take(self, rows: Array) -> Self:
+        """The cells of some rows of a batch, by number or by a mask; one cell is the same for all."""
+        return self
 
     @property
     @abstractmethod

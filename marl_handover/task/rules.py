@@ -135,7 +135,8 @@ class Rules:
 
     def of_rows(self, rows: Array) -> Rules:
         """The rules of some rows (by number, or a mask) of a batch of cells; of one cell itself."""
-        return self.on(self.cell.take(rows)) if isinstance(self.cell, CellBatch) else self
+        cell = self.cell.take(rows)
+        return self if cell is self.cell else self.on(cell)
 
     @property
     def external_finish(self) -> bool:
