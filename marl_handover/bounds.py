@@ -104,8 +104,8 @@ def name_field(default: str = "") -> Any:
     return _field(default, Bounds(longest=100, is_name=True))
 
 
-def sized(default: Callable[[], Any], low: int, high: int) -> Any:
-    """A dataclass field for a list or mapping of ``low`` to ``high`` items, made by ``default``."""
+def sized(default: Callable[[], Any] | None, low: int, high: int) -> Any:
+    """A dataclass field for a list or mapping of ``low`` to ``high`` items, made by ``default``; None: it may be left out."""
     return _field(default, Bounds(length=(low, high)))
 
 

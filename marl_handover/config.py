@@ -191,6 +191,7 @@ class CellConfig:
     arms: list[ArmConfig] = sized(
         list, 0, MOST_ARMS
     )  # one entry an arm; empty, or two that are not placed: face to face, base_distance_mm apart
+    enabled: list[str] | None = sized(None, 1, MOST_ARMS)  # names of the arms that are in order; null: all of them
     obstacles: list[ObstacleConfig] = sized(list, 0, 64)  # discs on which nothing may be put: x_mm, y_mm, radius_mm, height_mm
     base_distance_mm: float | None = bounded(None, 10.0, 10_000.0)  # null: 0.78 of the sum of the outer radii, if that gives a shared space
     grasp_link: str = ""  # the robots' tip
@@ -239,7 +240,7 @@ class LayoutConfig:
             raise InvalidSetting("layouts.r_min_mm", self.r_min_mm, f"below layouts.r_max_mm = {self.r_max_mm}")
 
 
-CELL_ALIASES = {key: f"cell.{key}" for key in ("robot", "shapes")}
+CELL_ALIASES = {key: f"cell.{key}" for key in ("robot", "shapes")} | {"arms.enabled": "cell.enabled"}
 """Short keys of commands that have a cell."""
 
 

@@ -16,6 +16,10 @@ REACH_TOLERANCE_MM = 1e-3
 """Membership has this tolerance everywhere: at beta = +-1 float32 rounding would put one chart point in ten outside."""
 
 
+PAIR_NAMES = ("left", "right")
+"""Names of the arms of a mirrored pair."""
+
+
 @dataclass(frozen=True)
 class Arm:
     """An arm that stands on the table.

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marl_handover.cell.arm import Arm, mirrored_pair
+from marl_handover.cell.arm import PAIR_NAMES, Arm, mirrored_pair
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.reach import AnnulusFit, ManipulationGrid, fit_annulus, manipulation_grid, require_grasps
 from marl_handover.cell.shared_space import SharedSpace
@@ -61,14 +61,30 @@ class CellModel(NamedTuple):
             raise UnequalArms("reach", {arm.name: arm.robot for arm in self.cell.arms})
         return self.fits[0]
 
+    def with_arms(self, names: Sequence[str]) -> CellModel:
+        """The model of :meth:`Cell.with_arms`, in which the others do not stand at all."""
+        cell, grid = self.cell.with_arms(names), self.grid
+        left = [self.cell.names.index(name) for name in cell.names]
+        heights, masks = tuple(grid.pick_heights_mm[arm] for arm in left), grid.masks[left]
+        masks.setflags(write=False)
+        return CellModel(
+            cell,
+            tuple(self.arms[arm] for arm in left),
+            ManipulationGrid(grid.x_mm, grid.y_mm, masks, cell.bases, heights),
+            tuple(self.fits[arm] for arm in left),
+            tuple(self.robots[arm] for arm in left),
+        )
+
 
 def build_cell(config: CellConfig) -> CellModel:
-    """Compute the cell of ``config``.
+    """Compute the cell of ``config``, with the arms that are in order.
 
     Raises:
         InvalidSetting, MissingFile, UrdfError, NoSharedSpace, UnconnectedArms: where a setting, the URDF or the geometry cannot be.
     """
     config.validate()
+    if config.enabled is not None:
+        return build_cell(replace(config, enabled=None)).with_arms(config.enabled)
     names, robots = _named(config)
     settings = {robot: robot_of(config, robot) for robot in dict.fromkeys(robots)}
     kinds = {robot: _Kind(each, read_robot(each)) for robot, each in settings.items()}
@@ -168,7 +184,7 @@ def _bases(config: CellConfig) -> tuple[SE2, ...]:
 def _named(config: CellConfig) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Name and robot of each arm."""
     if not config.arms:
-        return ("left", "right"), (config.robot, config.robot)
+        return PAIR_NAMES, (config.robot, config.robot)
     names = tuple(arm.name for arm in config.arms)
     for index, name in enumerate(names):
         if not name or name in names[:index]:
@@ -234,5 +250,6 @@ def load_cell(cell: str | CellConfig = "paper") -> Cell:
     config = cell_config(cell) if isinstance(cell, str) else cell
     key = to_yaml(config)
     if key not in _CELLS:
-        _CELLS[key] = build_cell(config).cell
+        whole = replace(config, enabled=None)
+        _CELLS[key] = build_cell(config).cell if config.enabled is None else load_cell(whole).with_arms(config.enabled)
     return _CELLS[key]

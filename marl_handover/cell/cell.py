@@ -7,6 +7,7 @@ angles in rad.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -14,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from marl_handover.arrays import Array, Floats, as_kind, kind_of, namespace, one_where
-from marl_handover.cell.arm import REACH_TOLERANCE_MM, Arm, Disc, lateral_rad
+from marl_handover.cell.arm import PAIR_NAMES, REACH_TOLERANCE_MM, Arm, Disc, lateral_rad
 from marl_handover.cell.chart import Chart, PaperChart
 from marl_handover.cell.sectors import Sectors, sector_limits
 from marl_handover.cell.shared_space import HandoverGraph, SharedSpace
 from marl_handover.cell.symmetry import ARM_LETTERS, Symmetry, View, pair_views, symmetries
-from marl_handover.config import CellConfig
+from marl_handover.config import CellConfig, require_choice
 from marl_handover.errors import BlockedPlace, InvalidSetting, OutOfReach, TwoArmsOnly, UnconnectedArms, UnequalArms
 from marl_handover.geometry.se2 import SE2
 
@@ -34,13 +35,15 @@ class Cell(Sectors):
 
     Raises:
         NoSharedSpace: the two arms of a pair have no chart in common.
-        UnconnectedArms: there are arms that cannot pass anything to the others, however long the way.
+        UnconnectedArms: there are arms that cannot pass anything to the others, however long the way; not where arms are out of order.
     """
 
     arms: tuple[Arm, ...]
     config: CellConfig
 
     def __post_init__(self) -> None:
+        if self.config.enabled is not None:
+            return  # that arms are out of order is nobody's mistake: what is left may be one arm, or arms that share nothing
         if self.num_arms != 2 and self.config.chart == "paper":
             raise InvalidSetting("cell.chart", "paper", f"'angle' or null for {self.num_arms} arms: the paper's chart is for two")
         if self.num_arms == 2:
@@ -61,7 +64,13 @@ class Cell(Sectors):
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """What traces and pictures call the arms: L and R in a mirrored pair, else by name."""
-        return self.names if self.config.arms else ARM_LETTERS
+        return self.names if self.config.arms else tuple(ARM_LETTERS[number] for number in self.numbers)
+
+    @cached_property
+    def numbers(self) -> tuple[int, ...]:
+        """Which arm of the whole cell each one is; they count from 0 without a gap unless arms are out of order."""
+        whole = [arm.name for arm in self.config.arms] or PAIR_NAMES
+        return tuple(whole.index(name) for name in self.names) if self.config.enabled else tuple(range(self.num_arms))
 
     @cached_property
     def bases(self) -> tuple[SE2, ...]:
@@ -115,7 +124,9 @@ class Cell(Sectors):
         charted = self.config.chart if self.num_arms == 2 else "angle"
         rest = self.config.chart_inset, charted, self.keep_out
         spaces = {(i, j): SharedSpace(self.arms[i], self.arms[j], *rest) for i, j in pairs}
-        return HandoverGraph(self.names, {pair: space for pair, space in spaces.items() if self.num_arms == 2 or not space.is_empty})
+        # What two arms share has to be something, or there is no pair; its chart says why it is nothing.
+        needed = self.num_arms == 2 and self.config.enabled is None
+        return HandoverGraph(self.names, {pair: space for pair, space in spaces.items() if needed or not space.is_empty})
 
     @cached_property
     def keep_out(self) -> tuple[Disc, ...]:
@@ -134,7 +145,7 @@ class Cell(Sectors):
     @cached_property
     def _arc_table(self) -> Floats:
         found = {pair: space.chart.arcs for pair, space in self.graph.edges.items()}
-        table = np.zeros((2, self.num_arms, self.num_arms, max(len(arcs) for arcs in found.values())))
+        table = np.zeros((2, self.num_arms, self.num_arms, max((len(arcs) for arcs in found.values()), default=1)))
         table[1] = -1.0
         for (i, j), arcs in found.items():
             for number, arc in enumerate(arcs):
@@ -154,8 +165,10 @@ class Cell(Sectors):
 
     @cached_property
     def shared(self) -> SharedSpace:
-        """What the two arms of a pair share; in any other cell raises :class:`TwoArmsOnly`."""
+        """What the two arms of a pair share. Raises :class:`TwoArmsOnly` in any other cell, :class:`UnconnectedArms` if it is nothing."""
         self.require_pair("the one chart of a cell")
+        if not self.graph.edges:
+            raise UnconnectedArms([[name] for name in self.names], bool(self.keep_out))
         return self.graph.edges[(0, 1)]
 
     def paper_chart(self, what: str) -> PaperChart:
@@ -182,13 +195,13 @@ class Cell(Sectors):
 
     def place_mm(self, arm: Array, receiver: Array, alpha: Array, beta: Array) -> Array:
         """World position (..., 2) in mm of chart coordinates in what ``arm`` and ``receiver`` (...) share; NaN where they share nothing."""
-        if self.num_arms == 2:
+        if self.num_arms == 2 and self.graph.edges:
             apart = arm != receiver
             return one_where(apart, self.shared.to_table(alpha, beta), math.nan * namespace(alpha).stack([alpha, beta], -1))
         return self.graph.table.to_world(self.edge(arm, receiver), alpha, beta)
 
     def edge(self, arm: Array, receiver: Array) -> Array:
-        """Row of the graph's table of what ``arm`` and ``receiver`` (...) share, or -1; not of a pair, which has a chart of its own."""
+        """Row of the graph's table of what ``arm`` and ``receiver`` (...) share, or -1; a pair has a chart of its own instead."""
         number: Array = self.graph.number
         if isinstance(arm, (np.ndarray, np.generic)):
             return number[arm, receiver]
@@ -210,6 +223,26 @@ class Cell(Sectors):
         if block.pin_diameter_mm >= 2 * finger_travel_mm:
             limit = f"above {block.pin_diameter_mm / 2:g}, half of cell.block.pin_diameter_mm: fingers have to pass the pin"
             raise InvalidSetting("motion.finger_travel_mm", finger_travel_mm, limit)
+
+    def with_arms(self, names: Sequence[str]) -> Cell:
+        """The cell while only the arms ``names`` are in order: the graph without the others. All of them: the cell itself.
+
+        They keep their order, their places and what any two share. They may be a single arm, and need not be able to pass to each other.
+        :attr:`numbers` says which arms of the whole cell they are.
+
+        Raises:
+            UnknownChoice, InvalidSetting: no arm has a name, one comes twice, or there is none.
+        """
+        for number, name in enumerate(names):
+            require_choice("cell.enabled", name, self.names)
+            if name in names[:number]:
+                raise InvalidSetting("cell.enabled", list(names), f"arms that are in order, each once; {name!r} comes twice")
+        if not names:
+            raise InvalidSetting("cell.enabled", [], f"at least one of: {', '.join(self.names)}")
+        left = tuple(arm for arm in self.arms if arm.name in names)
+        if len(left) == self.num_arms:
+            return self
+        return replace(self, arms=left, config=replace(self.config, enabled=[arm.name for arm in left]))
 
     def with_inset(self, chart_inset: float) -> Cell:
         """The same cell with another part of the chart in use."""

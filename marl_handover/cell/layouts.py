@@ -34,7 +34,6 @@ def layout_cell(arms: Sequence[Mapping[str, Any]], obstacles: Sequence[Mapping[s
         NoSharedSpace, UnconnectedArms: some arms cannot pass anything to the others.
     """
     _require_list("arms", arms, 2, MOST_ARMS)
-    _require_list("obstacles", obstacles, 0, 64)
     listed: list[Arm] = []
     for number, record in enumerate(arms):
         arm = _arm(f"arms[{number}]", record)
@@ -46,11 +45,17 @@ def layout_cell(arms: Sequence[Mapping[str, Any]], obstacles: Sequence[Mapping[s
                 limit = f"at least {LEAST_BASE_DISTANCE_MM:g} mm from that of {other.name!r}, whose base stands there"
                 raise InvalidSetting(f"the base of arm {arm.name!r}, {apart:.1f} mm away,", arm.base.position_mm.tolist(), limit)
         listed.append(arm)
-    discs = [_obstacle(f"obstacles[{number}]", record) for number, record in enumerate(obstacles)]
+    discs = obstacle_configs(obstacles)
     named = [ArmConfig(arm.name, arm.base.x_mm, arm.base.y_mm, math.degrees(arm.base.facing_rad)) for arm in listed]
     base = CellConfig() if config is None else config
     chart = "angle" if base.chart == "angle" else None
-    return Cell(tuple(listed), replace(base, name="layout", arms=named, obstacles=discs, chart=chart, base_distance_mm=None))
+    return Cell(tuple(listed), replace(base, name="layout", arms=named, enabled=None, obstacles=discs, chart=chart, base_distance_mm=None))
+
+
+def obstacle_configs(records: Sequence[Mapping[str, Any]]) -> list[ObstacleConfig]:
+    """Settings of obstacles as :func:`layout_cell` takes them. Raises :class:`InvalidSetting`, :class:`NotFinite`."""
+    _require_list("obstacles", records, 0, 64)
+    return [_obstacle(f"obstacles[{number}]", record) for number, record in enumerate(records)]
 
 
 def _require_list(what: str, records: Any, least: int, most: int) -> None:

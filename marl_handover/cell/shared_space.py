@@ -38,8 +38,9 @@ class HandoverGraph:
     def table(self) -> EdgeTable:
         """The angle charts of all edges, in the order of :attr:`edges`."""
         rows = [space.angle_chart.row for space in self.edges.values()]
-        pairs, discs, arcs = zip(*rows, strict=True)
-        return EdgeTable(np.stack(pairs), discs, arcs, next(iter(self.edges.values())).inset)
+        pairs, discs, arcs = zip(*rows, strict=True) if rows else ((), (), ())
+        inset = next((space.inset for space in self.edges.values()), 1.0)
+        return EdgeTable(np.reshape(pairs, (-1, 15)), discs, arcs, inset)
 
     @cached_property
     def number(self) -> NDArray[np.int64]:

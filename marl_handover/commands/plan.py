@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -155,7 +155,8 @@ def _planner(config: PlanConfig, policy: SupervisorPolicy) -> MotionPlanner | No
     from marl_handover.motion.planner import MotionPlanner
 
     try:
-        return MotionPlanner(build_cell(policy.rules.cell.config), config.arm_motion)
+        # An arm out of order stands where it stands: the others keep clear of it.
+        return MotionPlanner(build_cell(replace(policy.rules.cell.config, enabled=None)), config.arm_motion)
     except InvalidSetting as error:
         key = f"arm_{error.name}" if error.name.startswith("motion.") else error.name
         raise InvalidSetting(key, error.value, error.limit) from error

@@ -142,4 +142,4 @@ def _space(summary: dict[str, Any]) -> str:
     if summary["hand_over_rad"] is not None:
         arcs = [f"{math.degrees(low):.1f} to {math.degrees(high):.1f}" for low, high in summary["hand_over_rad"]]
         return f"hand-over angles {' and '.join(arcs)} deg"
-    return ", ".join(" and ".join(pair) for pair in summary["shared"])
+    return ", ".join(" and ".join(pair) for pair in summary["shared"]) or "none"

@@ -68,9 +68,8 @@ class SupervisorPolicy(ABC):
     def _others_of_many(self, action: Floats) -> Floats:
         """All choices of a cell of N arms at the place of ``action`` (..., size), the most similar first: (..., k, size)."""
         graph, count = self.rules.cell.graph, self.rules.cell.num_arms
-        choices = [
-            (final, arm, receiver) for final in (0, 1) for arm in range(count) for receiver in graph.neighbours(arm)[: 1 if final else None]
-        ]
+        ends = [(1, arm, (*graph.neighbours(arm), arm)[0]) for arm in range(count)]  # the receiver means nothing
+        choices = [(0, arm, receiver) for arm in range(count) for receiver in graph.neighbours(arm)] + ends
         final, arm, receiver = (np.array(column) for column in zip(*choices, strict=True))
         was_final, was_arm = action[..., :1] > 0, action[..., 1 : 1 + count].argmax(-1)[..., None]
         order = np.argsort(2 * (arm != was_arm) + (final != was_final), -1, kind="stable")

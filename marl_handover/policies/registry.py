@@ -48,10 +48,11 @@ def names() -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def _hops(num_arms: int, edges: tuple[tuple[int, int], ...]) -> NDArray[np.int64]:
-    """The fewest hand-overs from each arm to each other one: (num_arms, num_arms)."""
+    """The fewest hand-overs from each arm to each other one: (num_arms, num_arms); ``num_arms`` where there is no way."""
     adjacency = np.zeros((num_arms, num_arms))
-    adjacency[tuple(zip(*edges, strict=True))] = 1.0
-    return shortest_path(adjacency, directed=False, unweighted=True).astype(np.int64)
+    for edge in edges:
+        adjacency[edge] = 1.0
+    return np.minimum(shortest_path(adjacency, directed=False, unweighted=True), num_arms).astype(np.int64)
 
 
 @POLICIES.register("exact")

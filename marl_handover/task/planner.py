@@ -69,10 +69,11 @@ class ExactPlanner:
                 low, high = arc.low_rad, 2 * math.pi - arc.back_low_rad
                 hops += [(i, j, number, low, high), (j, i, number, -high, -low)]
         hops.sort(key=lambda hop: hop[:3])
-        start, end, arc_number, least, most = (np.array(column) for column in zip(*hops, strict=True))
+        columns = zip(*hops, strict=True) if hops else ((),) * 5
+        start, end, arc_number, least, most = (np.array(column, float if number > 2 else int) for number, column in enumerate(columns))
         _compile()
         rules, period = self.rules, self._period
-        found = all_ways(rules.cell.num_arms, start, end, least.astype(float), most.astype(float), rules.config.max_steps, period)
+        found = all_ways(rules.cell.num_arms, start, end, least, most, rules.config.max_steps, period)
         return found, (end, arc_number)
 
     @cached_property
@@ -146,6 +147,8 @@ class ExactPlanner:
         xp, cell = namespace(plan.fraction), self.rules.cell
         giver, receiver, taken = self._movers(plan, index)
         edge, lows, back_lows, widths = self._arc_table(plan.fraction)
+        if not self._arcs:
+            return math.nan * xp.stack([plan.fraction, plan.fraction], -1)
         number = edge[giver, receiver]
         upward = xp.where(giver < receiver, lows[number, taken], back_lows[number, taken]) + plan.fraction * widths[number, taken]
         gamma = xp.where(giver < receiver, upward, 2 * math.pi - upward)
@@ -161,7 +164,7 @@ class ExactPlanner:
 
     def _arc_table(self, like: Array) -> Any:
         """Row of the edge of two arms, and lowest angles there and back and widths of its arcs, (num_arms, num_arms) and (edges, arcs)."""
-        most = max(len(arcs) for arcs in self._arcs.values())
+        most = max((len(arcs) for arcs in self._arcs.values()), default=1)
         rows = np.zeros((3, len(self._arcs), most))
         for number, arcs in enumerate(self._arcs.values()):
             for arc, each in enumerate(arcs):
@@ -183,7 +186,8 @@ class ExactPlanner:
         """Arms, and arcs taken, of all ways (2, ways, max_steps); what comes after a walk's end repeats its last arms, to and fro."""
         longest = max(len(walk) for walk in self.walks)
         table = np.zeros((2, len(self._ways), longest), np.int64)
-        onward = [self.rules.cell.graph.neighbours(arm)[0] for arm in range(self.rules.cell.num_arms)]
+        graph = self.rules.cell.graph
+        onward = [next(iter(graph.neighbours(arm)), arm) for arm in range(len(graph.names))]
         for row, (walk, arcs) in enumerate(self._ways):
             arms = list(walk)
             while len(arms) < longest:
@@ -199,7 +203,9 @@ class ExactPlanner:
         giver, receiver, _ = self._movers(plan, 0)
         one = xp.ones_like(plan.fraction)
         final = xp.where(plan.transfers == 1, one, -one)
-        if cell.num_arms == 2:
+        if not self._arcs:
+            coordinates = place_mm[..., 0], place_mm[..., 1]
+        elif cell.num_arms == 2:
             coordinates = cell.shared.from_table(place_mm)
         else:
             coordinates = cell.graph.table.from_world(cell.edge(giver, receiver), place_mm)

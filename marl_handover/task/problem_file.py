@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.arrays import Floats, wrap
-from marl_handover.cell import Arm, Cell, layout_cell
+from marl_handover.cell import Cell, layout_cell
+from marl_handover.cell.layouts import obstacle_configs
 from marl_handover.errors import BadLine, CorruptFile, HandoverError, InvalidSetting, NotFinite
 from marl_handover.files import read_bounded
 from marl_handover.parsing import LINES_BYTES, parse_object
@@ -106,17 +107,11 @@ def _pose(cell: Cell, row: Mapping[str, Any], name: str, path: Path, line: int) 
     return np.concatenate([pose[:2], np.atleast_1d(wrap(pose[2]))])
 
 
-def _record(arm: Arm) -> dict[str, Any]:
-    base = {"name": arm.name, "x_mm": arm.base.x_mm, "y_mm": arm.base.y_mm, "facing_rad": arm.base.facing_rad}
-    return {**base, "r_min_mm": arm.r_min_mm, "r_max_mm": arm.r_max_mm, "yaw_range_rad": list(arm.yaw_rad)}
-
-
 def _cell(cell: Cell, own: Mapping[str, Any], path: Path, line: int) -> Cell:
     """The cell that a line brings; one that brings obstacles alone puts them into ``cell``."""
     try:
         if ARMS in own:
             return layout_cell(own[ARMS], own.get(OBSTACLES, ()), cell.config)
-        obstacles = layout_cell([_record(arm) for arm in cell.arms], own[OBSTACLES], cell.config).config.obstacles
-        return replace(cell, config=replace(cell.config, obstacles=obstacles))
+        return replace(cell, config=replace(cell.config, obstacles=obstacle_configs(own[OBSTACLES])))
     except HandoverError as error:
         raise BadLine(WHAT, path, line, error) from error

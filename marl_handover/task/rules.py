@@ -177,8 +177,8 @@ class Rules:
             final = xp.zeros_like(final)
         alpha, beta = xp.clip(action[..., -2], -1.0, 1.0), xp.clip(action[..., -1], -1.0, 1.0)
         if count == 2:
-            arm = xp.where(action[..., 1] > 0, 1, 0)
-            return Command(final, arm, self.cell.graph.edges[(0, 1)].to_table(alpha, beta), 1 - arm)
+            arm, space = xp.where(action[..., 1] > 0, 1, 0), self.cell.graph.edges.get((0, 1))
+            return Command(final, arm, math.nan * action[..., -2:] if space is None else space.to_table(alpha, beta), 1 - arm)
         arm, receiver = xp.argmax(action[..., 1 : 1 + count], -1), xp.argmax(action[..., 1 + count : 1 + 2 * count], -1)
         return Command(final, arm, self.cell.place_mm(arm, receiver, alpha, beta), receiver)
 
