@@ -52,6 +52,16 @@ def select(values: Array, index: Array) -> Array:
     return values.gather(-1, index.unsqueeze(-1)).squeeze(-1)
 
 
+def taken(values: Array, index: Array) -> Array:
+    """``values`` (..., n) at the integer ``index`` (..., m) of their last axis: (..., m)."""
+    return np.take_along_axis(values, index, -1) if isinstance(values, np.ndarray) else values.gather(-1, index)
+
+
+def ascending(values: Array) -> Array:
+    """``values`` sorted along their last axis."""
+    return np.sort(values, -1) if isinstance(values, np.ndarray) else values.sort(-1).values
+
+
 def one_where(condition: Array, chosen: Array, other: Array) -> Array:
     """``where`` for vectors: ``condition`` of shape (...), ``chosen`` and ``other`` of shape (..., n)."""
     return namespace(condition).where(condition[..., None], chosen, other)

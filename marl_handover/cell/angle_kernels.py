@@ -7,10 +7,8 @@ import math
 import numpy as np
 
 from marl_handover.cell.fibres import Floats, Ints, arcsine, beside, found_fibre, is_shared, length, point_at, seen, split, wrapped
+from marl_handover.cell.sectors import ARC_GAP
 from marl_handover.compiled import compiled
-
-GAP = 1e-3
-"""Between what two arcs have of alpha: one half of it belongs to the end of either, so that rounding does not change the arc."""
 
 OUTSIDE = 2.0
 """The beta of a place that lies between two pieces of a fibre, or on none."""
@@ -27,7 +25,7 @@ def stretch(arcs: Floats, count: int) -> float:
     halves = 0.0
     for arc in range(count):
         halves += arcs[arc, 1]
-    return halves / (1.0 - GAP * (count - 1) / 2)
+    return halves / (1.0 - ARC_GAP * (count - 1) / 2)
 
 
 @compiled
@@ -39,9 +37,9 @@ def place(
     for arc in range(count):
         middle = start + arcs[arc, 1] / unit
         offset = (alpha - middle) * unit
-        if arc == 0 or offset >= -arcs[arc, 1] - unit * GAP / 2:
+        if arc == 0 or offset >= -arcs[arc, 1] - unit * ARC_GAP / 2:
             taken, there = arc, offset
-        start += 2 * arcs[arc, 1] / unit + GAP
+        start += 2 * arcs[arc, 1] / unit + ARC_GAP
     there = min(arcs[taken, 1], max(-arcs[taken, 1], there)) * inset
     eta, pieces = found_fibre(pair, discs, arcs[taken, 0] + there, arcs[taken], out, edges)
     sign, e, _, sin_e = split(pair, eta)
@@ -94,7 +92,7 @@ def coordinates(
         if abs(offset) - arcs[arc, 1] < nearest:
             nearest, taken = abs(offset) - arcs[arc, 1], arc
             alpha = start + (arcs[arc, 1] + offset / inset) / unit
-        start += 2 * arcs[arc, 1] / unit + GAP
+        start += 2 * arcs[arc, 1] / unit + ARC_GAP
     if not is_shared(pair, discs, x, y, NEAR_MM):
         return alpha, OUTSIDE
     there = min(arcs[taken, 1], max(-arcs[taken, 1], wrapped(eta - arcs[taken, 0])))

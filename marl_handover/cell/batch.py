@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from marl_handover.arrays import Array, Floats, as_kind, kind_of, namespace
 from marl_handover.cell.arm import REACH_TOLERANCE_MM
 from marl_handover.cell.cell import Cell
-from marl_handover.cell.chart import EdgeTable
+from marl_handover.cell.chart import EdgeTable, arm_row
 from marl_handover.cell.layouts import layout_cell
 from marl_handover.cell.sectors import Sectors, sector_limits
 from marl_handover.config import BlockConfig, LayoutConfig
@@ -22,12 +22,20 @@ from marl_handover.errors import InvalidSetting
 LEAST_ROOM = 3
 """Arms that a batch has room for at least: actions of two arms have a form of their own."""
 
+Layout = tuple[Floats, Floats]
+"""Arms (N, 8) and keep-out discs (M, 3), as :class:`LayoutPool` has them."""
+
 _MOST_ARCS = 32
 _TRIES = 2000
 
 
 class LayoutPool:
     """Layouts that a batch of cells draws from, with all that their arms share; padded to the one with the most arms.
+
+    Args:
+        layouts: see :meth:`extend`.
+        block: what is handed over.
+        room: arms that there is room for at least.
 
     Attributes:
         arms: (L, N, 8) x, y, facing, least and greatest radius, least and greatest yaw, lateral offset; what is not there is 0.
@@ -37,36 +45,52 @@ class LayoutPool:
         table: the edges of all layouts.
     """
 
-    def __init__(self, layouts: list[tuple[Floats, Floats]], block: BlockConfig | None = None) -> None:
-        count, room = len(layouts), max(LEAST_ROOM, *(len(arms) for arms, _ in layouts))
-        self.block = block or BlockConfig()
-        self.arms, self.n_arms = np.zeros((count, room, 8)), np.array([len(arms) for arms, _ in layouts])
-        self.discs = np.zeros((count, max(len(discs) for _, discs in layouts), 3))
+    def __init__(self, layouts: Sequence[Layout], block: BlockConfig | None = None, room: int = LEAST_ROOM) -> None:
+        self.block, self.room = block or BlockConfig(), max(room, LEAST_ROOM)
+        self.layouts: list[Layout] = []
+        self._edges: list[tuple[NDArray[np.int64], Floats, Floats, list[Floats]]] = []
+        self.extend(layouts)
+
+    def extend(self, layouts: Sequence[Layout]) -> None:
+        """Add layouts: arms (N, 8) and discs (M, 3) each. Those that are there keep their numbers."""
+        self.layouts += layouts
+        self._edges += [_edges(standing, discs) for standing, discs in layouts]
+        count, room = len(self.layouts), max(self.room, *(len(arms) for arms, _ in self.layouts))
+        self.arms, self.n_arms = np.zeros((count, room, 8)), np.array([len(arms) for arms, _ in self.layouts])
+        self.discs = np.zeros((count, max(len(discs) for _, discs in self.layouts), 3))
         self.number = np.full((count, room, room), -1)
         pairs: list[Floats] = []
         there: list[Floats] = []
         arcs: list[Floats] = []
-        for row, (standing, discs) in enumerate(layouts):
+        for row, ((standing, discs), (number, of_pairs, of_discs, of_arcs)) in enumerate(zip(self.layouts, self._edges, strict=True)):
             self.arms[row, : len(standing)], self.discs[row, : len(discs)] = standing, discs
-            number, of_pairs, of_discs, of_arcs = _edges(standing, discs)
             self.number[row, : len(standing), : len(standing)] = np.where(number >= 0, number + len(pairs), -1)
             pairs += list(of_pairs)
             there += list(of_discs)
             arcs += of_arcs
         self.table = EdgeTable(np.array(pairs).reshape(-1, 15), there, arcs, 1.0)
+        for name in ("facts", "arcs"):
+            self.__dict__.pop(name, None)
 
     @classmethod
     def random(
-        cls, config: LayoutConfig, count: int, generator: np.random.Generator, on_layout: Callable[[int], None] = lambda made: None
+        cls,
+        config: LayoutConfig | Sequence[LayoutConfig],
+        count: int,
+        generator: np.random.Generator,
+        on_layout: Callable[[int], None] = lambda made: None,
     ) -> LayoutPool:
-        """``count`` connected layouts; ``on_layout`` is told how many are made."""
-        config.validate()
-        block = BlockConfig()
-        layouts: list[tuple[Floats, Floats]] = []
-        while len(layouts) < count:
-            layouts.append(random_layout(config, generator, block))
-            on_layout(len(layouts))
-        return cls(layouts, block)
+        """``count`` connected layouts; ``on_layout`` is told how many are made. Of several kinds, each is as likely for every layout."""
+        most = max(kind.arms[1] for kind in ([config] if isinstance(config, LayoutConfig) else config))
+        return cls(random_layouts(config, count, generator, on_layout), room=most)
+
+    @classmethod
+    def of_cell(cls, cell: Cell) -> LayoutPool:
+        """One cell as the only layout. Raises :class:`InvalidSetting` if a grip is beside its arm's plane."""
+        if any(arm.lateral_mm for arm in cell.arms):
+            raise InvalidSetting("cell.arms", list(cell.names), "arms whose grip is in their plane, for a batch of cells")
+        discs = np.array([[*disc] for disc in cell.keep_out]).reshape(-1, 3)
+        return cls([(np.stack([arm_row(arm) for arm in cell.arms]), discs)], cell.config.block)
 
     def __len__(self) -> int:
         return len(self.arms)
@@ -167,6 +191,15 @@ class CellBatch(Sectors):
         """World position (n, ..., 2) in mm of chart coordinates in what two arms of a row share; NaN where they share nothing."""
         return self.pool.table.to_world(self.edge(arm, receiver), alpha, beta)
 
+    def at_angle(self, giver: Array, receiver: Array, angle_rad: Array) -> Array:
+        """As :class:`Sectors` says."""
+        upward = namespace(angle_rad).where(giver < receiver, angle_rad, -angle_rad)
+        return self.pool.table.at_angle(self.edge(giver, receiver), upward)
+
+    def coordinates(self, giver: Array, receiver: Array, place_mm: Array) -> Array:
+        """As :class:`Sectors` says."""
+        return namespace(place_mm).stack(list(self.pool.table.from_world(self.edge(giver, receiver), place_mm)), -1)
+
     def edge(self, arm: Array, receiver: Array) -> NDArray[np.int64]:
         """Row of the pool's table of what ``arm`` and ``receiver`` (n, ...) share, or -1."""
         giver, taker = (each.cpu().numpy() if hasattr(each, "cpu") else np.asarray(each) for each in (arm, receiver))
@@ -205,13 +238,32 @@ class CellBatch(Sectors):
         return rows.reshape(*rows.shape[:2], *[1] * between, *rows.shape[2:]) if between > 0 else rows
 
 
-def random_layout(config: LayoutConfig, generator: np.random.Generator, block: BlockConfig) -> tuple[Floats, Floats]:
+def random_layouts(
+    config: LayoutConfig | Sequence[LayoutConfig],
+    count: int,
+    generator: np.random.Generator,
+    on_layout: Callable[[int], None] = lambda made: None,
+) -> list[Layout]:
+    """As :meth:`LayoutPool.random` says."""
+    kinds = [config] if isinstance(config, LayoutConfig) else list(config)
+    for kind in kinds:
+        kind.validate()
+    block, layouts = BlockConfig(), []
+    while len(layouts) < count:
+        kind = kinds[int(generator.integers(len(kinds)))] if len(kinds) > 1 else kinds[0]
+        layouts.append(random_layout(kind, generator, block))
+        on_layout(len(layouts))
+    return layouts
+
+
+def random_layout(config: LayoutConfig, generator: np.random.Generator, block: BlockConfig) -> Layout:
     """Arms (N, 8) and keep-out discs (M, 3) of one connected layout, as :class:`LayoutPool` has them.
 
     Raises :class:`InvalidSetting` if none is found.
     """
+    size = int(generator.integers(config.arms[0], config.arms[1] + 1))  # once: many arms are harder to stand, and as likely
     for _ in range(_TRIES):
-        arms = _random_arms(config, generator)
+        arms = _random_arms(config, size, generator)
         if arms is None or not _is_connected(_edges(arms, np.empty((0, 3)))[0]):
             continue
         count = int(generator.integers(config.obstacles[0], config.obstacles[1] + 1))
@@ -225,9 +277,8 @@ def random_layout(config: LayoutConfig, generator: np.random.Generator, block: B
     raise InvalidSetting("layouts", f"spacing_mm {config.spacing_mm}, yaw_deg {config.yaw_deg}", limit)
 
 
-def _random_arms(config: LayoutConfig, generator: np.random.Generator) -> Floats | None:
+def _random_arms(config: LayoutConfig, count: int, generator: np.random.Generator) -> Floats | None:
     """Arms one after the other, each some way from one that stands and turned towards it within its yaws; None if one has no room."""
-    count = int(generator.integers(config.arms[0], config.arms[1] + 1))
     arms = np.zeros((count, 8))
     for number in range(count):
         half = math.radians(_drawn(generator, config.yaw_deg))

@@ -200,6 +200,19 @@ class Cell(Sectors):
             return one_where(apart, self.shared.to_table(alpha, beta), math.nan * namespace(alpha).stack([alpha, beta], -1))
         return self.graph.table.to_world(self.edge(arm, receiver), alpha, beta)
 
+    def at_angle(self, giver: Array, receiver: Array, angle_rad: Array) -> Array:
+        """As :class:`Sectors` says."""
+        upward = namespace(angle_rad).where(giver < receiver, angle_rad, -angle_rad)
+        if self.num_arms == 2 and self.graph.edges:
+            return self.shared.in_world(self.chart.at_angle(upward))
+        return self.graph.table.at_angle(self.edge(giver, receiver), upward)
+
+    def coordinates(self, giver: Array, receiver: Array, place_mm: Array) -> Array:
+        """As :class:`Sectors` says."""
+        if self.num_arms == 2 and self.graph.edges:
+            return namespace(place_mm).stack(list(self.shared.from_table(place_mm)), -1)
+        return namespace(place_mm).stack(list(self.graph.table.from_world(self.edge(giver, receiver), place_mm)), -1)
+
     def edge(self, arm: Array, receiver: Array) -> Array:
         """Row of the graph's table of what ``arm`` and ``receiver`` (...) share, or -1; a pair has a chart of its own instead."""
         number: Array = self.graph.number

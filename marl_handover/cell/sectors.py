@@ -6,8 +6,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Sized
 from typing import Self
 
-from marl_handover.arrays import Array, namespace, wrap
+from marl_handover.arrays import Array, namespace, select, wrap
 from marl_handover.cell.arm import REACH_TOLERANCE_MM
+
+
+ARC_GAP = 1e-3
+"""Between what two intervals of hand-over angles have of alpha: one half of it belongs to the end of either, so that rounding does not
+change the interval."""
 
 
 class Sectors(ABC):
@@ -37,6 +42,17 @@ class Sectors(ABC):
 
         Of a batch of cells (cells, num_arms, num_arms, K).
         """
+
+    @abstractmethod
+    def at_angle(self, giver: Array, receiver: Array, angle_rad: Array) -> Array:
+        """World place (..., 2) in mm of a hand-over at the angle psi_giver - psi_receiver (...), in the middle of those that have it.
+
+        NaN where the two arms share nothing.
+        """
+
+    @abstractmethod
+    def coordinates(self, giver: Array, receiver: Array, place_mm: Array) -> Array:
+        """Chart coordinates (..., 2) of world places (..., 2) in what ``giver`` and ``receiver`` (...) share."""
 
     def take(self, rows: Array) -> Self:
         """The cells of some rows of a batch, by number or by a mask; one cell is the same for all."""
@@ -112,3 +128,16 @@ def sector_limits(r_min_mm: float, r_max_mm: float, yaw_low_rad: float, yaw_high
     low, high = r_min_mm - REACH_TOLERANCE_MM, r_max_mm + REACH_TOLERANCE_MM
     slack = REACH_TOLERANCE_MM / r_min_mm
     return low * low, high * high, yaw_low_rad - slack, yaw_high_rad + slack
+
+
+def chart_alpha(half_rad: Array, arc: Array, place: Array) -> Array:
+    """The angle chart's alpha (...) of ``place`` (...), which goes from -1 to 1 over interval ``arc`` (...) of hand-over angles.
+
+    ``half_rad`` (..., K): half widths of all intervals of the pair, below 0 for none. Places are of the first arm handing to the second;
+    the other way round they count backwards.
+    """
+    xp = namespace(half_rad)
+    halves = xp.clip(half_rad, 0, None)
+    unit = halves.sum(-1) / (1 - ARC_GAP * ((half_rad >= 0).sum(-1) - 1) / 2)
+    before = select(xp.cumsum(halves, -1) - halves, arc)
+    return -1 + ARC_GAP * arc + (2 * before + select(halves, arc) * (1 + place)) / unit

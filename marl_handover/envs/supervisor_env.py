@@ -37,6 +37,7 @@ class SupervisorEnv(EnvBase):
         seed: seed of problems and noise.
         rules: another rule book than that of cell and task.
         layouts: draw each episode's cell from these, instead of one for all; the tensordict then carries its number, ``layout``.
+            Layouts that are added to the pool later are drawn instead of as many of the first ones.
     """
 
     batch_locked = True
@@ -54,7 +55,7 @@ class SupervisorEnv(EnvBase):
         require_at_least("num_envs", num_envs, 1)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         task = task or TaskConfig()
-        self.layouts = layouts
+        self.layouts, self.drawn_layouts = layouts, 0 if layouts is None else len(layouts)
         if layouts is None:
             cell = cell or load_cell()
             self.rules = rules or Rules(cell, task, motion_cost(cell, task))
@@ -81,7 +82,7 @@ class SupervisorEnv(EnvBase):
             "outcome": Bounded(0, max(Outcome), shape=(count, 1), dtype=torch.int64, device=device),
         }
         if self.layouts is not None:
-            problem["layout"] = Bounded(0, len(self.layouts) - 1, shape=(count, 1), dtype=torch.int64, device=device)
+            problem["layout"] = Unbounded(shape=(count, 1), dtype=torch.int64, device=device)
         self.observation_spec = Composite(problem, shape=self.batch_size, device=device)
         self.action_spec = Bounded(-1.0, 1.0, shape=(count, self.rules.action_size), device=device)
         self.reward_spec = Unbounded(shape=(count, 1), device=device)
@@ -115,7 +116,8 @@ class SupervisorEnv(EnvBase):
         fresh = self.batch_size[0] if everyone or rows is None else len(rows)
         rules, layout = self.rules, None
         if self.layouts is not None:
-            layout = torch.randint(len(self.layouts), (fresh,), generator=self.generator, device=self.device)
+            last = len(self.layouts)
+            layout = torch.randint(last - self.drawn_layouts, last, (fresh,), generator=self.generator, device=self.device)
             rules = self.rules.on(CellBatch(self.layouts, layout.cpu().numpy()))
         pose, goal = sample_problems(rules.cell, fresh, self.generator, torch.float32)
         epsilon = self.draw_epsilon(fresh)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from marl_handover.cell.batch import LayoutPool, random_layouts
+from marl_handover.config import LayoutConfig
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.replay import EpisodeWriter
+from marl_handover.progress import working
 from marl_handover.task.rules import Outcome
 
 Explore = Callable[[Tensor], Tensor]
@@ -51,6 +56,40 @@ class Collector(ABC):
         """Let go of processes, if it has any."""
 
 
+class LayoutStream:
+    """Random cells that are drawn anew in the course of training.
+
+    Args:
+        pool: takes the layouts, from the first ones on.
+        kinds: of layouts.
+        interval: environment steps after which as many new ones take the place of those that are drawn from.
+        generator: of layouts.
+    """
+
+    def __init__(self, pool: LayoutPool, kinds: Sequence[LayoutConfig], interval: int, generator: np.random.Generator) -> None:
+        self.pool, self.kinds, self.interval, self.generator = pool, kinds, interval, generator
+        self.at_once, self.since = len(pool), 0
+
+    def follow(self, steps: int) -> None:
+        """So many environment steps are about to be made."""
+        if self.since >= self.interval:
+            self.since = 0
+            with working("drawing new cells"):
+                self.pool.extend(random_layouts(self.kinds, self.at_once, self.generator))
+        self.since += steps
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain tensors, numbers and text."""
+        layouts = [[torch.from_numpy(arms), torch.from_numpy(discs)] for arms, discs in self.pool.layouts]
+        return {"layouts": layouts, "since": self.since, "random": json.dumps(self.generator.bit_generator.state)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`state_dict`, for a pool that still has its first layouts only."""
+        self.pool.extend([(arms.numpy(), discs.numpy()) for arms, discs in state["layouts"][len(self.pool) :]])
+        self.since = state["since"]
+        self.generator.bit_generator.state = json.loads(state["random"])
+
+
 class BatchedCollector(Collector):
     """One step of every cell of a batched environment.
 
@@ -58,15 +97,20 @@ class BatchedCollector(Collector):
         env: the cells.
         keep_episodes: hand over whole episodes, for a replay memory.
         max_decisions: of an episode; the task's transfers if None.
+        layouts: where new cells come from, for an environment that draws them.
     """
 
-    def __init__(self, env: SupervisorEnv, keep_episodes: bool = True, max_decisions: int | None = None) -> None:
-        self.env, self.keep_episodes = env, keep_episodes
+    def __init__(
+        self, env: SupervisorEnv, keep_episodes: bool = True, max_decisions: int | None = None, layouts: LayoutStream | None = None
+    ) -> None:
+        self.env, self.keep_episodes, self.layouts = env, keep_episodes, layouts
         self.writer = EpisodeWriter(env.batch_size[0], max_decisions or env.rules.config.max_steps, env.device)
         self.current: TensorDictBase | None = None
 
     def collect(self, explore: Explore) -> Collected:
         """One step of all cells."""
+        if self.layouts is not None:
+            self.layouts.follow(self.env.batch_size[0])
         if self.current is None:
             self.current = self.env.reset()
         self.current["action"] = explore(self.current["observation"])
@@ -82,10 +126,13 @@ class BatchedCollector(Collector):
     def state_dict(self) -> dict[str, Any]:
         """The running episodes, and the random state of problems and noise."""
         current = None if self.current is None else self.current.to_dict()
-        return {"writer": self.writer.state_dict(), "current": current, "random": self.env.generator.get_state()}
+        state = {"writer": self.writer.state_dict(), "current": current, "random": self.env.generator.get_state()}
+        return state if self.layouts is None else {**state, "layouts": self.layouts.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`."""
+        if self.layouts is not None:
+            self.layouts.load_state_dict(state["layouts"])
         self.writer.load_state_dict(state["writer"])
         if state["current"] is not None:
             self.current = TensorDict(state["current"], self.env.batch_size, device=self.env.device)

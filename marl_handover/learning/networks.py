@@ -111,13 +111,18 @@ class ActionDistribution(NamedTuple):
     log_std: Tensor
 
 
+def squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Reparametrised numbers in (-1, 1) and their log-densities, elementwise."""
+    raw = mean + log_std.exp() * noise
+    log_prob = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+    # log(1 - tanh(x)^2), stable at saturation
+    return raw.tanh(), log_prob - 2 * (math.log(2) - raw - F.softplus(-2 * raw))
+
+
 def squashed_sample(branches: ActionDistribution, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Reparametrised places (n, arms, components, 2) in (-1, 1) and their log-densities (n, arms, components)."""
-    raw = branches.mean + branches.log_std.exp() * noise
-    log_prob = -0.5 * noise.square() - branches.log_std - 0.5 * math.log(2 * math.pi)
-    # log(1 - tanh(x)^2), stable at saturation
-    log_prob = log_prob - 2 * (math.log(2) - raw - F.softplus(-2 * raw))
-    return raw.tanh(), log_prob.sum(-1)
+    place, log_prob = squashed(branches.mean, branches.log_std, noise)
+    return place, log_prob.sum(-1)
 
 
 def chosen_action(logits: Tensor, place: Tensor, noise: Tensor | None = None) -> Tensor:

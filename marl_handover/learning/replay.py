@@ -22,6 +22,7 @@ from torchrl.data import HERReplayBuffer, LazyTensorStorage
 from marl_handover.arrays import one_where, wrap
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.settings import ReplayConfig
+from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Command, Rules, carried
 
 logging.getLogger("torchrl").setLevel(logging.WARNING)  # which its import sets to tell of every memory that is made
@@ -42,7 +43,8 @@ class EpisodeWriter:
 
     def add(self, transition: TensorDictBase) -> TensorDict | None:
         """Take one step of all cells, (num_envs,); return the rows of the episodes it ended, or None."""
-        step = TensorDict({key: transition[key] for key in STORED[:4]}, transition.batch_size, device=transition.device)
+        kept = [key for key in (*STORED[:4], "layout") if key in transition]
+        step = TensorDict({key: transition[key] for key in kept}, transition.batch_size, device=transition.device)
         step.update({key: transition["next", key] for key in STORED[4:]})
         if self.rows is None:
             self.rows = step.unsqueeze(1).expand(len(self.length), self.max_steps).clone().zero_()
@@ -115,6 +117,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
         count = batch_size or 1
         index = torch.randint(len(self), (count,), generator=self.draw, device=self.draw.device)
         batch = self._storage.get(index)
+        self.rules = self.env.rules_of(batch)
         batch["final"] = self.rules.decode(batch["action"]).final
         batch["epsilon"] = self.env.draw_epsilon(count)[:, None]
         own = batch["desired_goal"]
@@ -207,12 +210,14 @@ class HindsightReplayBuffer(HERReplayBuffer):
         return age + offset >= 0
 
     def _relabel_random(self, batch: TensorDictBase, index: Tensor) -> None:
-        """Goal := another row's goal, for hand-overs, which do not depend on the goal."""
+        """Goal := another row's goal, for hand-overs, which do not depend on the goal. Where each row has its own cell, a new one there."""
         count = len(index)
         share = self.config.hindsight.random_ratio if self.config.hindsight.strategy != "none" else 0.0
         chosen = self._chance(count, share) & ~batch["hindsight"][:, 0] & ~batch["final"]
-        other = torch.randint(len(self), (count,), generator=self.draw, device=index.device)
-        goals = self._storage.get(other)["desired_goal"]
+        if self.env.layouts is None:
+            goals = self._storage.get(torch.randint(len(self), (count,), generator=self.draw, device=index.device))["desired_goal"]
+        else:
+            goals = sample_problems(self.rules.cell, count, self.draw, torch.float32)[1]
         batch["desired_goal"] = one_where(chosen & batch["feasible"][:, 0], goals, batch["desired_goal"])
 
     def _mirror(self, batch: TensorDictBase) -> None:
@@ -234,7 +239,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
         final = torch.where(batch["final"], 1.0, -1.0)
         action = torch.cat([final[:, None], batch["action"][:, 1:]], -1) if not self.rules.external_finish else batch["action"]
         following = {
-            "observation": self.env.observe(placed, goal, after, epsilon),
+            "observation": self.env.observe(placed, goal, after, epsilon, self.rules),
             "achieved_goal": placed,
             "previous_arm": after[:, None],
             "reward": reward,
@@ -243,7 +248,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
         }
         return TensorDict(
             {
-                "observation": self.env.observe(pose, goal, previous, epsilon),
+                "observation": self.env.observe(pose, goal, previous, epsilon, self.rules),
                 "achieved_goal": pose,
                 "desired_goal": goal,
                 "epsilon": batch["epsilon"],

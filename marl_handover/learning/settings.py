@@ -17,6 +17,7 @@ from marl_handover.config import (
     CellConfig,
     CentralisedConfig,
     DecentralisedConfig,
+    LayoutConfig,
     TaskConfig,
     bounded,
     changed,
@@ -158,6 +159,43 @@ class SacConfig(OffPolicyConfig):
 
 
 @dataclass
+class GraphSacConfig(OffPolicyConfig):
+    """Hybrid SAC over hand-over graphs, for cells of any number of arms: a soft choice by values, tanh-Gaussian places."""
+
+    name: str = "graph_sac"
+    layout: str = chosen("graph", LAYOUTS)  # observation layout
+    learning_starts: int = bounded(2000, 0, 10**9)
+    env_steps_per_gradient_step: float = bounded(16.0, 0.01, 1e6)
+    batch_size: int = bounded(128, 1, 65_536)
+    lr_decay_start: float = bounded(0.6, 0.0, 1.0)
+    width: int = bounded(64, 16, 1024)  # of what the network keeps of an arm; a multiple of 16
+    rounds: int = bounded(6, 0, 64)  # of messages between arms, all by the same layers; 0: every arm for itself
+    slack: bool = True  # whether it is told how far an angle is inside what lets the next arm finish
+    mixture_components: int = bounded(4, 1, 64)  # places an interval of hand-over angles, chosen between like the other branches
+    candidates: int = bounded(
+        6, 1, 256
+    )  # places an interval tried anywhere, and as many nearby; the actor is drawn to the nearest better one
+    candidate_weight: float = bounded(2.0, 0.0, 1e6)
+    candidate_margin: float = bounded(0.15, -1e6, 1e6)  # in units of scaled reward
+    finish_weight: float = bounded(0.2, 0.0, 1e6)  # of the critic of finishing beside that of handing over
+    temperature_start: float = bounded(0.3, 1e-9, 1e3)  # of the choice between branches, in units of scaled reward; falls linearly ...
+    temperature_end: float = bounded(0.03, 1e-9, 1e3)
+    place_temperature: float = bounded(0.02, 0.0, 1e3)
+    random_place: float = bounded(0.1, 0.0, 1.0)  # share of exploration's places that are drawn anywhere
+    deterministic_env_fraction: float = bounded(0.25, 0.0, 1.0)  # of the cells, which follow the likeliest branch
+    layouts_at_once: int = bounded(1024, 1, 10**6)  # random cells that episodes are drawn from ...
+    layouts_interval: int = bounded(16_384, 1, 10**9)  # ... and environment steps after which as many others take their place
+
+    def validate(self) -> None:
+        """Raise :class:`InvalidSetting` on a value out of its limits."""
+        super().validate()
+        if self.width % 16:
+            raise InvalidSetting("algorithm.width", self.width, "a multiple of 16")
+        if self.layout != "graph":
+            raise InvalidSetting("algorithm.layout", self.layout, "'graph' for algorithm=graph_sac")
+
+
+@dataclass
 class HindsightConfig:
     """Relabelling of sampled transitions; every relabelled transition is a true one of the problem, under noise as often as it would be.
 
@@ -185,6 +223,7 @@ ALGORITHMS: Registry[type[AlgorithmConfig]] = Registry(
     "algorithm",
     {
         "sac": "marl_handover.learning.hybrid_sac:SacConfig",
+        "graph_sac": "marl_handover.learning.graph_sac:GraphSacConfig",
         "flat_sac": "marl_handover.baselines.flat_sac:FlatSacConfig",
         "td3": "marl_handover.baselines.td3:Td3Config",
         "ppo": "marl_handover.baselines.ppo:PpoConfig",
@@ -209,6 +248,7 @@ class TrainConfig:
     """A training run."""
 
     cell: CellConfig = field(default_factory=CellConfig)
+    layouts: list[LayoutConfig] = sized(list, 0, 100)  # of algorithm=graph_sac: random cells of these kinds instead of the one cell
     task: TaskConfig = field(default_factory=TaskConfig)
     algorithm: AlgorithmConfig = field(default_factory=SacConfig)
     replay: ReplayConfig = field(default_factory=ReplayConfig)
@@ -263,9 +303,31 @@ class TrainConfig:
         self.decentralised.validate()
         if self.variant == "decentralised":
             self._validate_decentralised()
+        self._validate_layouts()
         self._validate_source()
         self._refuse_idle()
         self._refuse_large()
+
+    def _validate_layouts(self) -> None:
+        """What a learner of any cell cannot do, and what no other does."""
+        for layouts in self.layouts:
+            layouts.validate()
+        if not isinstance(self.algorithm, GraphSacConfig):
+            if self.layouts:
+                raise InvalidSetting("layouts", len(self.layouts), "left out, or algorithm=graph_sac")
+            return
+        noise = self.task.noise
+        limits: tuple[tuple[str, Any, Any, str], ...] = (
+            ("task.architecture", self.task.architecture, "B", "whose policy acts under A, too"),
+            ("source", self.source, "batched", "the rule book itself"),
+            ("replay.symmetry", self.replay.symmetry, False, "whose cells have no mirror image of their own"),
+            ("replay.correct_terminated", self.replay.correct_terminated, True, "which derives it"),
+            ("task.reward.motion_weight", self.task.reward.motion_weight, 0.0, "whose paths have no price"),
+            ("task.noise", noise.observed or noise.position_mm > 0 or noise.yaw_deg > 0, False, "which learns on exact arms"),
+        )
+        for name, value, only, reason in limits:
+            if value != only:
+                raise InvalidSetting(name, value, f"{only} with algorithm=graph_sac, {reason}")
 
     def _refuse_large(self) -> None:
         """Raise :class:`InvalidSetting` for settings that are moderate each, and together take more memory than a training needs."""

@@ -8,6 +8,7 @@ import multiprocessing
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,10 @@ from marl_handover.learning.algorithm import OwnTorch, compile_state, subnormals
 from marl_handover.learning.checkpoint import FILE, load_checkpoint, save_checkpoint
 from marl_handover.learning.collector import Collected
 from marl_handover.learning.recorder import Recorder, check_finite, machine
-from marl_handover.learning.settings import Curriculum, OffPolicyConfig, OnPolicyConfig, TrainConfig
-from marl_handover.learning.variant import make_variant
+from marl_handover.learning.settings import Curriculum, GraphSacConfig, OffPolicyConfig, OnPolicyConfig, TrainConfig
+from marl_handover.learning.variant import Validation, make_variant
 from marl_handover.locks import claimed
 from marl_handover.parsing import parse_yaml
-from marl_handover.task.planner import ExactPlanner
-from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome
 
 VALIDATION_SEED = 2_000_000_000
@@ -82,7 +81,8 @@ class Trainer:
     def _build(self) -> None:
         config = self.config
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
-        load_cell(config.cell).require_pair("training")
+        if not isinstance(config.algorithm, GraphSacConfig):
+            load_cell(config.cell).require_pair(f"training with algorithm={config.algorithm.name}")
         self.variant = make_variant(config.variant)
         self.env = self.variant.env(config, self.device)
         self.rules = self.env.rules
@@ -218,16 +218,20 @@ class Trainer:
             **{name: float(value) for name, value in self.losses.items()},
         }
 
+    @cached_property
+    def validation(self) -> Validation:
+        """The problems that the run is watched on, always the same."""
+        generator = torch.Generator(device=self.device).manual_seed(VALIDATION_SEED + self.config.seed)
+        return self.variant.validation(self.rules, self.config, generator)
+
     def evaluate(self) -> dict[str, float]:
         """Success rate, mean steps and ratio to the optimum of the deterministic policy on the run's own validation problems.
 
         With the noise of the task, if it has any. Mean steps count ``task.max_steps`` for an episode in which no arm moves any more.
         """
-        generator = torch.Generator(device=self.device).manual_seed(VALIDATION_SEED + self.config.seed)
-        start, goal = sample_problems(self.rules.cell, self.config.evaluation_episodes, generator, torch.float32)
-        episodes = self.variant.play(self.algorithm, start, goal)
+        rules, start, goal, optimum = self.validation
+        episodes = self.variant.play(self.algorithm, start, goal, rules)
         solved = episodes.outcome == int(Outcome.SUCCESS)
-        optimum = ExactPlanner(self.rules).plan(start.double(), goal.double()).transfers
         ratio = (episodes.transfers / optimum)[solved & (optimum > 0)]
         return {
             "success_rate": float(solved.double().mean()),

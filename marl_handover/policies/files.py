@@ -13,6 +13,7 @@ from marl_handover.compose import from_mapping
 from marl_handover.config import CellConfig, NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.errors import CorruptFile
 from marl_handover.files import read_arrays
+from marl_handover.learning.graph_network import layer_sizes, stored_shape
 from marl_handover.parsing import parse_object
 from marl_handover.task.observations import observation_size
 
@@ -22,6 +23,7 @@ KINDS = {
     "centralised": "marl_handover.policies.centralised:CentralisedPolicy",
     "centralised_box": "marl_handover.policies.centralised:CentralisedPolicy",
     "discrete": "marl_handover.policies.actor:DiscretePolicy",
+    "graph": "marl_handover.policies.graph_policy:GraphPolicy",
     "turns": "marl_handover.policies.actor:TurnsPolicy",
 }
 """Forms of an actor, and the class that evaluates each, imported when it is needed."""
@@ -66,7 +68,11 @@ def require_policy(arrays: Mapping[str, NDArray[Any]], path: Path, what: str) ->
         about = parse_object(str(arrays["about"]))
         _require_known(about)
         for network in range(about.get("networks", 1)):
-            _check_chain(network_layers(arrays, about, network))
+            layers = network_layers(arrays, about, network)
+            if about["kind"] == "graph":
+                _check_sizes(layers, layer_sizes(stored_shape(about["shape"])))
+            else:
+                _check_chain(layers)
         observation_size(about["layout"])
         stored_settings(about)
     except Exception as error:  # json and the settings raise many kinds
@@ -96,13 +102,27 @@ def network_layers(arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any],
     return [(arrays[f"{prefix}weight_{index}"], arrays[f"{prefix}bias_{index}"]) for index in range(about["layers"])]
 
 
-def _check_chain(layers: Layers) -> None:
-    """Raise unless every number is real and finite, and each layer takes what the one before gives."""
-    width = None
-    for index, (weight, bias) in enumerate(layers):
-        for name, array in (("weight", weight), ("bias", bias)):
+def _check_sizes(layers: Layers, sizes: Mapping[str, tuple[int, int]]) -> None:
+    """Raise unless every number is real and finite, and there are all layers, of the sizes (inputs, outputs) that they are to have."""
+    _check_numbers(layers)
+    found = [(*weight.shape, *bias.shape) for weight, bias in layers]
+    for index, (name, size) in enumerate(sizes.items()):
+        if found[index : index + 1] != [(*size, size[1])] or len(found) != len(sizes):
+            raise _NotPolicy(f"layer {index} ({name}) has other numbers of inputs and outputs than {size[0]} and {size[1]}")
+
+
+def _check_numbers(layers: Layers) -> None:
+    for index, layer in enumerate(layers):
+        for name, array in zip(("weight", "bias"), layer, strict=True):
             if array.dtype.kind != "f" or not np.isfinite(array).all():
                 raise _NotPolicy(f"{name} {index} has numbers that are not real and finite ({array.dtype})")
+
+
+def _check_chain(layers: Layers) -> None:
+    """Raise unless every number is real and finite, and each layer takes what the one before gives."""
+    _check_numbers(layers)
+    width = None
+    for index, (weight, bias) in enumerate(layers):
         if weight.ndim != 2 or bias.shape != weight.shape[1:] or width not in (None, len(weight)):
             raise _NotPolicy(f"layer {index} has shapes {weight.shape} and {bias.shape}, which do not fit together")
         width = len(bias)

@@ -38,7 +38,7 @@ POLICIES: Registry[Callable[[Rules, int], SupervisorPolicy]] = Registry("policy"
 _FAR_MM2 = 1e12
 """Squared distance that counts for more than any between an arm and an object."""
 
-PRETRAINED = ("pretrained_a", "pretrained_b", "pretrained_twin")
+PRETRAINED = ("pretrained_a", "pretrained_b", "pretrained_twin", "pretrained_any")
 
 
 def names() -> tuple[str, ...]:
@@ -152,8 +152,8 @@ class GreedyPolicy(SupervisorPolicy):
 def load(
     name: str, cell: Cell | None = None, task: TaskConfig | None = None, seed: int = 0, *, motion: MotionConfig | None = None
 ) -> SupervisorPolicy:
-    """A policy by name: ``exact``, ``random``, ``greedy``, ``pretrained_a``, ``pretrained_b``, ``pretrained_twin``, a run
-    directory or a policy file (``.npz``), or any of these shielded, as ``shielded:NAME``.
+    """A policy by name: ``exact``, ``random``, ``greedy``, ``pretrained_a``, ``pretrained_b``, ``pretrained_twin``, ``pretrained_any``,
+    a run directory or a policy file (``.npz``), or any of these shielded, as ``shielded:NAME``.
 
     Args:
         name: see above.
@@ -224,7 +224,7 @@ def adapted(
     settings = replace(own.rules.config, **{key: value for key, value in changes.items() if value is not None})
     settings.validate()
     trained = own.rules.config.architecture
-    if own.about and settings.architecture != trained:
+    if own.about and not own.any_cell and settings.architecture != trained:
         raise CheckpointMismatch(name, "architecture", trained, settings.architecture)
     return own.under(_rules(own.rules.cell if cell is None else load_cell(cell), settings, motion, own.about))
 
@@ -254,7 +254,7 @@ def _rules(cell: Cell, task: TaskConfig, motion: MotionConfig | None, about: Map
     Raises:
         TwoArmsOnly: the policy of a file is to act in a cell of other than two arms.
     """
-    if about:
+    if about and about["kind"] != "graph":
         cell.require_pair("a trained policy")
     if about and about["variant"] == "centralised":
         from marl_handover.envs.centralised import CentralisedRules

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marl_handover.arrays import Array, namespace
+from marl_handover.cell.batch import CellBatch
 from marl_handover.cell.symmetry import NO_ARM
 from marl_handover.task.rules import External, Outcome, Rules, Transition, Verdict
 
@@ -123,15 +124,18 @@ def measured_verdict(rules: Rules, placed: Array, goal: Array, final: Array, tri
 
 def play(
     rules: Rules,
-    act: Act,
+    act: Act | Callable[[Rules], Act],
     pose: Array,
     goal: Array,
     epsilon_rad: float | None = None,
     noise: Noise | None = None,
     observer: Observer | None = None,
 ) -> Episodes:
-    """Play every problem, pose and goal (n, 3), to its end. Only running episodes are computed."""
-    xp = namespace(pose)
+    """Play every problem, pose and goal (n, 3), to its end. Only running episodes are computed.
+
+    For a batch of cells ``act`` takes the rules of the rows that run, and returns the policy that acts under them.
+    """
+    xp, in_cells = namespace(pose), isinstance(rules.cell, CellBatch)
     count = len(pose)
     zero = xp.zeros_like(pose[:, 0])
     outcome = xp.where(zero == 0, int(Outcome.TIMEOUT), 0)
@@ -143,7 +147,7 @@ def play(
         here, there = pose, goal
         made = transfers[running]
         here_rules = rules.of_rows(running)
-        action = act(here, there, previous)
+        action = (act(here_rules) if in_cells else act)(here, there, previous)
         noises = [None if noise is None else noise(len(here)) for _ in range(2)]
         stepped = advance(
             here_rules, here, there, previous, action, made, epsilon_rad=epsilon_rad, noise=noises[0], final_noise=noises[1], may_wait=True

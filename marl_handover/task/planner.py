@@ -15,8 +15,10 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from marl_handover.arrays import Array, as_kind, namespace, one_where
+from marl_handover.cell.batch import CellBatch
 from marl_handover.errors import BlockedPlace, OutOfReach, counted
 from marl_handover.progress import working
 from marl_handover.task.plan_kernels import all_ways, shortest
@@ -151,10 +153,7 @@ class ExactPlanner:
             return math.nan * xp.stack([plan.fraction, plan.fraction], -1)
         number = edge[giver, receiver]
         upward = xp.where(giver < receiver, lows[number, taken], back_lows[number, taken]) + plan.fraction * widths[number, taken]
-        gamma = xp.where(giver < receiver, upward, 2 * math.pi - upward)
-        if cell.num_arms == 2:
-            return cell.shared.in_world(cell.chart.at_angle(gamma))
-        return cell.graph.table.at_angle(number, gamma)
+        return cell.at_angle(giver, receiver, xp.where(giver < receiver, upward, upward - 2 * math.pi))
 
     def _movers(self, plan: Plan, index: int) -> tuple[Array, Array, Array]:
         """The arm that moves the object ``index`` transfers after the first, the one after that, and the arc of their hand-over."""
@@ -203,19 +202,24 @@ class ExactPlanner:
         giver, receiver, _ = self._movers(plan, 0)
         one = xp.ones_like(plan.fraction)
         final = xp.where(plan.transfers == 1, one, -one)
-        if not self._arcs:
-            coordinates = place_mm[..., 0], place_mm[..., 1]
-        elif cell.num_arms == 2:
-            coordinates = cell.shared.from_table(place_mm)
-        else:
-            coordinates = cell.graph.table.from_world(cell.edge(giver, receiver), place_mm)
-        passed = xp.stack(list(coordinates), -1)
+        passed = cell.coordinates(giver, receiver, place_mm) if self._arcs else place_mm
         chart = one_where(plan.transfers > 1, passed, xp.zeros_like(passed))
         if cell.num_arms == 2:
             scores = [xp.where(plan.first_arm == 1, one, -one)]
         else:
             scores = [xp.where(who == arm, one, -one) for who in (giver, receiver) for arm in range(cell.num_arms)]
         return xp.concat([xp.stack([final, *scores], -1), xp.clip(chart, -1.0, 1.0)], -1)
+
+
+def optimal_transfers(rules: Rules, pose: Array, goal: Array) -> NDArray[np.int64]:
+    """The fewest transfers (n,) from each pose to each goal (n, 3), 0 where no plan exists; of a batch of cells, each in its own."""
+    if not isinstance(rules.cell, CellBatch):
+        return np.asarray(ExactPlanner(rules).plan(pose, goal).transfers)
+    found = np.zeros(len(pose), np.int64)
+    for layout in np.unique(rules.cell.layout):
+        rows = rules.cell.layout == layout
+        found[rows] = np.asarray(ExactPlanner(rules.on(rules.cell.pool.cell(int(layout)))).plan(pose[rows], goal[rows]).transfers)
+    return found
 
 
 @cache
