@@ -386,9 +386,9 @@ class Decentralised(Variant):
         learners = config.decentralised.learners
         return TurnReplay(_turn_rules(env.rules), config.replay, env, generator, learners != "ctde", learners == "independent")
 
-    def policy(self, algorithm: Algorithm) -> Act:
+    def policy(self, algorithm: Algorithm, rules: Rules | None = None) -> Act:
         """The deterministic policies as one supervisor, L first. Two passes in a row: no arm moves."""
-        rules = _turn_rules(algorithm.rules)
+        rules = _turn_rules(rules or algorithm.rules)
 
         def asked(pose: Tensor, goal: Tensor, turn: Tensor) -> Tensor:
             both = observe(rules, "relative", pose, goal, torch.full_like(turn, NO_ARM))

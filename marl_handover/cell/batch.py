@@ -248,7 +248,8 @@ def random_layouts(
     kinds = [config] if isinstance(config, LayoutConfig) else list(config)
     for kind in kinds:
         kind.validate()
-    block, layouts = BlockConfig(), []
+    block = BlockConfig()
+    layouts: list[Layout] = []
     while len(layouts) < count:
         kind = kinds[int(generator.integers(len(kinds)))] if len(kinds) > 1 else kinds[0]
         layouts.append(random_layout(kind, generator, block))

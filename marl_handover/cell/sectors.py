@@ -9,7 +9,6 @@ from typing import Self
 from marl_handover.arrays import Array, namespace, select, wrap
 from marl_handover.cell.arm import REACH_TOLERANCE_MM
 
-
 ARC_GAP = 1e-3
 """Between what two intervals of hand-over angles have of alpha: one half of it belongs to the end of either, so that rounding does not
 change the interval."""

@@ -227,7 +227,7 @@ def arrival(graph: HandoverGraphs, angle: Array, place: Array) -> Array:
 
 
 class Choice(NamedTuple):
-    """Decisions (...): whether ``final``, the ``arm``; of a hand-over the ``edge``, a row of the graph's intervals, and the ``place`` in it.
+    """Decisions (...): ``final`` or not, the ``arm``; of a hand-over the ``edge``, a row of the graph's intervals, and the ``place`` in it.
 
     ``value``: what the decision is worth, minus infinity where no arm can do anything.
     """
@@ -265,7 +265,8 @@ def chosen(graph: HandoverGraphs, value: Array, place: Array, finish: Array, mos
 
     Args:
         graph: of the problems.
-        value, place: (E, m) of hand-overs; a minus infinite value is never chosen while there is another.
+        value: (E, m) of hand-overs; a minus infinite one is never chosen while there is another.
+        place: (E, m) of hand-overs, in (-1, 1).
         finish: (A,) values of finishing.
         most: how many.
     """

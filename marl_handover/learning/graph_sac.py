@@ -9,7 +9,7 @@ is a tanh-Gaussian, one network for all. Hindsight gives the states their goals 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -21,6 +21,7 @@ from marl_handover.learning.graph_network import (
     Choice,
     GraphShape,
     HandoverGraphs,
+    Layers,
     arrival,
     best_places,
     branches,
@@ -45,8 +46,15 @@ class GraphNetwork(nn.ModuleDict):
 
     def __init__(self, shape: GraphShape) -> None:
         super().__init__({name: nn.Linear(*size) for name, size in layer_sizes(shape).items()})
+        bias = self["place_out"].bias
+        assert isinstance(bias, nn.Parameter)
         with torch.no_grad():  # components start apart, so that they do not learn the same thing
-            self["place_out"].bias[: shape.components] = torch.linspace(-1.0, 1.0, shape.components) if shape.components > 1 else 0.0
+            bias[: shape.components] = torch.linspace(-1.0, 1.0, shape.components) if shape.components > 1 else 0.0
+
+    @property
+    def layers(self) -> Layers:
+        """The layers as what :mod:`~marl_handover.learning.graph_network` asks for."""
+        return cast(Layers, self)
 
     def parts(self, of_actor: bool) -> list[nn.Parameter]:
         """Parameters of the actor, or of the critic, which owns what both know of the graph."""
@@ -80,7 +88,7 @@ class GraphSac(Algorithm):
         own = self.config
         self.shape = GraphShape(own.width, own.rounds, own.mixture_components, own.slack)
         self.network = GraphNetwork(self.shape).to(self.device)
-        self.average = averaging(self.network)
+        self.average: GraphNetwork = averaging(self.network)
         rate = own.learning_rate
         self.actor_optimizer = torch.optim.Adam(self.network.parts(of_actor=True), lr=rate, fused=True)
         self.critic_optimizer = torch.optim.Adam(self.network.parts(of_actor=False), lr=rate, fused=True)
@@ -95,7 +103,7 @@ class GraphSac(Algorithm):
 
     def exported(self) -> list[list[nn.Linear]]:
         """All layers, in the order of :func:`layer_sizes`."""
-        return [list(self.average.values())]
+        return [[layer for layer in self.average.values() if isinstance(layer, nn.Linear)]]
 
     def about(self) -> dict[str, Any]:
         """The form of the network."""
@@ -121,13 +129,13 @@ class GraphSac(Algorithm):
     def explore(self, observation: Tensor) -> Tensor:
         """A branch and a place drawn from the policy."""
         graph = self.graphs(observation)
-        known = embedded(self.network, self.shape, graph)
+        known = embedded(self.network.layers, self.shape, graph)
         sampled = self._sampled(graph, known, graph.angle)
         place = torch.where(
             self._uniform(sampled.place.shape) < self.config.random_place, self._anywhere(sampled.place.shape), sampled.place
         )
-        value = self._value(self.network, graph, known, graph.angle, place)
-        finish = finish_value(self.network, self.shape, graph, torch.arange(len(graph.arm), device=self.device), graph.angle)
+        value = self._value(self.network.layers, graph, known, graph.angle, place)
+        finish = finish_value(self.network.layers, self.shape, graph, torch.arange(len(graph.arm), device=self.device), graph.angle)
         noise = self._gumbel(value.shape), self._gumbel(finish.shape)
         # Some cells follow the likeliest branch: where that goes in circles, its states must get into the memory.
         steady = torch.arange(graph.count, device=self.device) < int(self.config.deterministic_env_fraction * graph.count)
@@ -139,20 +147,20 @@ class GraphSac(Algorithm):
     def act(self, observation: Tensor) -> Tensor:
         """The best branch of both mirror images."""
         graph = self.graphs(observation)
-        value, place, finish = branches(self.average, self.shape, graph)
+        value, place, finish = branches(self.average.layers, self.shape, graph)
         return self._action(observation, graph, chosen(graph, value, place, finish))
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """One step of critic and actor, on the states that sampled transitions led to; on those they began with where they ended it."""
         over = batch["next", "terminated"]
         graph = self.graphs(torch.where(over, batch["observation"], batch["next", "observation"]))
-        known = embedded(self.network, self.shape, graph)
+        known = embedded(self.network.layers, self.shape, graph)
         sampled = self._sampled(graph, known.detach(), graph.angle)
         arm = torch.arange(len(graph.arm), device=self.device)
         with torch.no_grad():
             target, share = self._soft_value(graph, arm, sampled)
-        value = hand_over_value(self.network, self.shape, graph, known, arm, graph.angle)
-        finish = finish_value(self.network, self.shape, graph, arm, graph.angle)
+        value = hand_over_value(self.network.layers, self.shape, graph, known, arm, graph.angle)
+        finish = finish_value(self.network.layers, self.shape, graph, arm, graph.angle)
         loss_place = (value - target).square().mean(1).sum()
         loss_finish = (finish - self._finish_reward(graph)).square().mean()
         self.critic_optimizer.zero_grad()
@@ -168,10 +176,10 @@ class GraphSac(Algorithm):
     def _soft_value(self, graph: HandoverGraphs, arm: Tensor, sampled: Sampled) -> tuple[Tensor, Tensor]:
         """What handing over to each arm is worth by what it can do next, (A,), and the share (E, components) of each branch of it."""
         own, scale = self.config, self.config.reward_scale
-        known = embedded(self.average, self.shape, graph)
-        value = self._value(self.average, graph, known, graph.angle, sampled.place)
+        known = embedded(self.average.layers, self.shape, graph)
+        value = self._value(self.average.layers, graph, known, graph.angle, sampled.place)
         value = value - own.place_temperature * sampled.log_prob.clamp(-3.0, 6.0)
-        finish = finish_value(self.average, self.shape, graph, arm, graph.angle)
+        finish = finish_value(self.average.layers, self.shape, graph, arm, graph.angle)
         best = value.new_full(finish.shape, -torch.inf).scatter_reduce(0, graph.giver, value.amax(-1), "amax").maximum(finish)
         weight = ((value - best[graph.giver, None]) / self.temperature).exp()
         weight_finish = ((finish - best) / self.temperature).exp()
@@ -192,13 +200,13 @@ class GraphSac(Algorithm):
         own = self.config
         for parameter in self.network.parts(of_actor=False):
             parameter.requires_grad_(False)
-        value = self._value(self.network, graph, known, graph.angle, sampled.place)
+        value = self._value(self.network.layers, graph, known, graph.angle, sampled.place)
         loss = ((0.1 + share) * (own.place_temperature * sampled.log_prob - value)).mean()
         with torch.no_grad():
             component = torch.randint(own.mixture_components, (own.candidates,), generator=self.generator, device=self.device)
             beside = (sampled.mean[:, component] + self._nearby((len(graph.giver), own.candidates))).clamp(-1.0, 1.0)
             tried = torch.cat([sampled.mean, self._anywhere((len(graph.giver), own.candidates)), beside], -1)
-            worth = self._value(self.network, graph, known, graph.angle, tried)
+            worth = self._value(self.network.layers, graph, known, graph.angle, tried)
             best, taken = worth[:, : own.mixture_components].max(-1, keepdim=True)
             gain = worth[:, own.mixture_components :] - best - own.candidate_margin
         for parameter in self.network.parts(of_actor=False):
@@ -209,11 +217,11 @@ class GraphSac(Algorithm):
         return loss + own.candidate_weight * pull.mean()
 
     def _sampled(self, graph: HandoverGraphs, known: Tensor, angle: Tensor) -> Sampled:
-        mean, log_std = best_places(self.network, self.shape, graph, known, angle[graph.giver])
+        mean, log_std = best_places(self.network.layers, self.shape, graph, known, angle[graph.giver])
         place, log_prob = squashed(mean, log_std, self._noise(mean.shape))
         return Sampled(place, log_prob, mean.tanh())
 
-    def _value(self, layers: nn.ModuleDict, graph: HandoverGraphs, known: Tensor, angle: Tensor, place: Tensor) -> Tensor:
+    def _value(self, layers: Layers, graph: HandoverGraphs, known: Tensor, angle: Tensor, place: Tensor) -> Tensor:
         """The lower of both critics' values (E, m) of handing over at ``place`` (E, m) by arms that carry the object at ``angle`` (A,)."""
         there = arrival(graph, angle[graph.giver], place)
         value: Tensor = hand_over_value(layers, self.shape, graph, known, graph.receiver[:, None].expand_as(there), there).amin(0)

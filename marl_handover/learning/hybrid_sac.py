@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -25,6 +25,9 @@ from marl_handover.task.rules import Command, Rules
 
 EDGE = 1.15
 """Random places are drawn from a chart this much too large and brought back to its edge."""
+
+
+Network = TypeVar("Network", bound=nn.Module)
 
 
 class SoftValue(NamedTuple):
@@ -153,7 +156,7 @@ class HybridSacLoss(LossModule):
         return TensorDict({"loss_qvalue": critic, "loss_actor": actor, "entropy_branch": branch, "entropy_place": place})
 
 
-def averaging(module: nn.Module) -> nn.Module:
+def averaging(module: Network) -> Network:
     """A copy to hold the average of a module that is trained; without gradients."""
     return copy.deepcopy(module).requires_grad_(False)
 

@@ -43,8 +43,9 @@ class EpisodeWriter:
 
     def add(self, transition: TensorDictBase) -> TensorDict | None:
         """Take one step of all cells, (num_envs,); return the rows of the episodes it ended, or None."""
-        kept = [key for key in (*STORED[:4], "layout") if key in transition]
-        step = TensorDict({key: transition[key] for key in kept}, transition.batch_size, device=transition.device)
+        step = TensorDict({key: transition[key] for key in STORED[:4]}, transition.batch_size, device=transition.device)
+        if "layout" in transition.keys():  # noqa: SIM118 - a TensorDict
+            step["layout"] = transition["layout"]
         step.update({key: transition["next", key] for key in STORED[4:]})
         if self.rows is None:
             self.rows = step.unsqueeze(1).expand(len(self.length), self.max_steps).clone().zero_()

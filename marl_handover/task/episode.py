@@ -147,7 +147,8 @@ def play(
         here, there = pose, goal
         made = transfers[running]
         here_rules = rules.of_rows(running)
-        action = (act(here_rules) if in_cells else act)(here, there, previous)
+        policy: Any = act(here_rules) if in_cells else act  # type: ignore[call-arg]
+        action = policy(here, there, previous)
         noises = [None if noise is None else noise(len(here)) for _ in range(2)]
         stepped = advance(
             here_rules, here, there, previous, action, made, epsilon_rad=epsilon_rad, noise=noises[0], final_noise=noises[1], may_wait=True

@@ -134,6 +134,13 @@ def blocks(arms, discs, poses, order=None):
     return of_arms.reshape(-1, count, len(ARM_FIELDS)), of_pairs.reshape(-1, count, count, len(PAIR_FIELDS))
 
 
+def assert_same(found, expected, names):
+    """Blocks are equal, angles up to full turns."""
+    angles = np.array(["angle" in name or "middle" in name for name in names])
+    away = found - expected
+    np.testing.assert_allclose(np.where(angles, np.sin(away / 2), away), 0.0, atol=1e-6)
+
+
 @pytest.mark.parametrize("flip", [False, True])
 def test_the_graph_layout_does_not_see_where_the_table_is_and_turns_odd_fields_over_in_a_mirror(flip):
     draw = np.random.default_rng(7)
@@ -147,8 +154,8 @@ def test_the_graph_layout_does_not_see_where_the_table_is_and_turns_odd_fields_o
         signs = [
             np.where(np.isin(names, odd) & flip, -1, 1) for names, odd in ((ARM_FIELDS, ODD_ARM_FIELDS), (PAIR_FIELDS, ODD_PAIR_FIELDS))
         ]
-        np.testing.assert_allclose(there[0], of_arms * signs[0], atol=1e-6)
-        np.testing.assert_allclose(there[1], of_pairs * signs[1], atol=1e-6)
+        assert_same(there[0], of_arms * signs[0], ARM_FIELDS)
+        assert_same(there[1], of_pairs * signs[1], PAIR_FIELDS)
 
 
 def test_a_permutation_of_the_arms_permutes_the_blocks():
