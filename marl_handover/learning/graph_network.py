@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marl_handover.arrays import Array, namespace, select, taken, wrap
-from marl_handover.task.graph_observation import ARCS, ARM_FIELDS, PAIR_FIELDS
+from marl_handover.task.graph_observation import ARCS, ARM_FIELDS, LOG_SCALE, PAIR_FIELDS
 
 Layers = Mapping[str, Callable[[Array], Array]]
 
@@ -96,13 +96,13 @@ class HandoverGraphs:
         self.problem, self.arm = _nonzero(arms[..., 0] > 0)
         there = arms[self.problem, self.arm]
         self.reaches_object, self.was_previous = there[:, 1] > 0, there[:, 3] > 0
-        self.reaches_goal, self.angle, self.goal_angle = there[:, 2], there[:, 4], there[:, 5]
-        self.epsilon = xp.exp(there[:, 6])
+        self.reaches_goal, self.angle, self.goal_angle = there[:, 2], math.pi * there[:, 4], math.pi * there[:, 5]
+        self.epsilon = xp.exp(LOG_SCALE * there[:, 6])
         row = xp.full(arms.shape[:2], -1, dtype=xp.int64, **_on(arms))
         row[self.problem, self.arm] = xp.arange(len(there), **_on(arms))
         of, i, j, self.arc = _nonzero(pairs[..., 1] >= 0)
         self.giver, self.receiver = row[of, i], row[of, j]
-        self.middle, self.half = pairs[of, i, j, self.arc, 0], pairs[of, i, j, self.arc, 1]
+        self.middle, self.half = (math.pi * pairs[of, i, j, self.arc, number] for number in range(2))
         degree = xp.bincount(self.giver, minlength=len(there))
         first = xp.cumsum(degree, 0) - degree
         number = xp.arange(len(self.giver), **_on(self.giver))

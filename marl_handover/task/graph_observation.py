@@ -21,13 +21,16 @@ from marl_handover.task.observations import Layout
 from marl_handover.task.rules import Rules
 
 ARM_FIELDS = ("is_there", "reaches_object", "reaches_goal", "was_previous", "angle", "goal_angle", "log_epsilon")
-"""Angles in rad. ``angle`` is that of every arm, also of one that does not reach the object: it depends on who is to take it from where."""
+"""Angles in half turns. Every arm has an ``angle``, also one that does not reach the object: what it would carry it at if it took it."""
+
+LOG_SCALE = 4.0
+"""The logarithm of epsilon in rad is so many times what is shown."""
 
 ARCS = 4
 """Intervals of hand-over angles of an ordered pair that are shown: its widest, in their order. More are rare: two discs make three."""
 
 PAIR_FIELDS = tuple(f"{what}_{number}" for number in range(ARCS) for what in ("middle", "half"))
-"""Of each interval of hand-over angles: middle and half width in rad, from the giver's facing to the receiver's; half -1: there is none."""
+"""Of each interval of hand-over angles: middle and half width in half turns, from facing to facing; a half width of -1: there is none."""
 
 ODD_ARM_FIELDS = ("angle", "goal_angle")
 ODD_PAIR_FIELDS = tuple(name for name in PAIR_FIELDS if name.startswith("middle"))
@@ -46,16 +49,18 @@ def observe_graph(rules: Rules, pose: Array, goal: Array, previous_arm: Array, e
         cell.reached(square, yaw, pose) * one,
         cell.reached(goal_square, goal_yaw, goal) * one,
         moved,
-        wrap(k * ((pose[..., 2] - goal[..., 2])[..., None] - yaw)),
-        wrap(-k * goal_yaw),
-        xp.log(k * (epsilon_rad + 0 * pose[..., 0]))[..., None] * one,
+        wrap(k * ((pose[..., 2] - goal[..., 2])[..., None] - yaw)) / math.pi,
+        wrap(-k * goal_yaw) / math.pi,
+        xp.log(k * (epsilon_rad + 0 * pose[..., 0]))[..., None] / LOG_SCALE * one,
     ]
     arms = xp.stack(fields, -1) * there[..., None]
     middle, half = shown_arcs(rules, yaw[..., None] + 0 * yaw[..., None, :])
     facing = cell.gripper_yaw(0 * yaw)
     apart = (facing[..., :, None] - facing[..., None, :])[..., None]
     none = half < 0
-    pairs = xp.stack([xp.where(none, 0 * half, wrap(k * (middle - apart))), xp.where(none, half, xp.clip(k * half, None, math.pi))], -1)
+    pairs = xp.stack(
+        [xp.where(none, 0 * half, wrap(k * (middle - apart)) / math.pi), xp.where(none, half, xp.clip(k * half / math.pi, None, 1))], -1
+    )
     batch = arms.shape[:-2]
     return xp.concat([arms.reshape(*batch, -1), pairs.reshape(*batch, -1)], -1)
 

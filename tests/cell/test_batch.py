@@ -138,7 +138,7 @@ def assert_same(found, expected, names):
     """Blocks are equal, angles up to full turns."""
     angles = np.array(["angle" in name or "middle" in name for name in names])
     away = found - expected
-    np.testing.assert_allclose(np.where(angles, np.sin(away / 2), away), 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.where(angles, np.sin(np.pi * away / 2), away), 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("flip", [False, True])
