@@ -68,8 +68,19 @@ def table(report: dict[str, Any], result: Evaluation) -> str:
     for steps in np.unique(result.optimal[result.optimal > 0]):
         rows = result.optimal == steps
         lines.append(f"{steps:<22}{rows.sum():>12}{100 * solved[rows].mean():>11.2f}%{result.episodes.transfers[rows].mean():>12.3f}")
+    lines += _lines_by_arms(report) if "by_arms" in report else []
     lines += ["", outcomes, f"one decision: p50 {report['decision_us']['p50']:.0f} us, p99 {report['decision_us']['p99']:.0f} us"]
     return "\n".join(lines + (_loop_lines(report) if "success_in_the_end" in report else []))
+
+
+def _lines_by_arms(report: dict[str, Any]) -> list[str]:
+    """What only random cells have."""
+    lines = ["", f"{'arms':22}{'episodes':>12}{'success':>12}{'steps/opt.':>12}{'p50 us':>12}"]
+    for arms, part in report["by_arms"].items():
+        success, ratio = f"{100 * part['success_rate']:>11.2f}%", _number(part["steps_ratio"], 4)
+        lines.append(f"{arms:22}{part['episodes']:>12}{success}{ratio}{part['decision_us']['p50']:>12.0f}")
+    drawn = counted(report["layouts"], "random cell")
+    return [*lines, "", f"{drawn}; problems that no plan solves, left out: {report['unsolvable']}"]
 
 
 def _loop_lines(report: dict[str, Any]) -> list[str]:

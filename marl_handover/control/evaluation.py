@@ -22,6 +22,7 @@ from marl_handover.config import (
     ENGINES,
     PHYSICS,
     CellConfig,
+    LayoutConfig,
     LoopConfig,
     MotionConfig,
     TaskChanges,
@@ -34,15 +35,18 @@ from marl_handover.config import (
 )
 from marl_handover.envs.centralised import CentralisedRules, MotionCommand
 from marl_handover.envs.cycle_check import Refusal
-from marl_handover.errors import InvalidSetting
+from marl_handover.errors import InvalidSetting, WorkFailed
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.learning.evaluation import (
     TIMED_DECISIONS,
+    CellProblems,
     Evaluation,
     Trace,
     decision_times_us,
     evaluate,
+    evaluate_in_cells,
     joined,
+    problems_in_cells,
     random_problems,
     trace_text,
 )
@@ -64,6 +68,13 @@ CONTACT = frozenset({Refusal.MISSED_GRASP, Refusal.DROPPED, Refusal.TIPPED, Refu
 
 
 @dataclass
+class UnseenConfig(LayoutConfig):
+    """Random cells to judge a policy in, as those that it may be trained in, and how many of them."""
+
+    count: int = bounded(1000, 1, 10**5)  # cells; the episodes are spread evenly over them
+
+
+@dataclass
 class AssessmentConfig:
     """Who is judged, where, on which problems. What is not given is the policy's own, or the default."""
 
@@ -72,6 +83,7 @@ class AssessmentConfig:
     episodes: int = bounded(1000, 1, 10**6)  # random problems
     seed: int = seed_field()  # of the problems, and of execution noise but for the twin, whose servos go on as they are
     cell: CellConfig | None = None  # single keys change the paper cell
+    layouts: UnseenConfig | None = None  # random cells instead of the one cell; what no plan solves there is left out and counted
     task: TaskChanges = field(default_factory=TaskChanges)  # task.noise left out: of noisy, 1 mm and 0.5 deg
     grasp: str | None = chosen(None, ("friction", "constraint"))  # of bullet and mujoco; null: friction where that holds
     engine: str | None = chosen(None, ENGINES)  # of twin: its physics, bullet or mujoco; null: bullet where it is installed
@@ -86,6 +98,11 @@ class AssessmentConfig:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on what can be refused without playing."""
         check_bounds(self)
         backend_options(self)
+        if self.layouts is not None:
+            self.layouts.validate()
+            for key, value, usual in (("cell", self.cell, None), ("problems", self.problems, ""), ("backend", self.backend, "kinematic")):
+                if value != usual:
+                    raise InvalidSetting(key, value, f"{usual or 'left out'} with layouts, which are random cells under the rules alone")
 
 
 class Assessment(NamedTuple):
@@ -114,7 +131,7 @@ def assess(config: AssessmentConfig, traced: bool = False, progress: bool = Fals
     """
     config.validate()
     policy = policies.adapted(config.policy, config.cell, config.seed, motion=config.motion, **vars(config.task))
-    play = _play_kinematic if config.backend == "kinematic" else _play_loop
+    play = _play_loop if config.backend != "kinematic" else _play_kinematic if config.layouts is None else _play_layouts
     result, trace_text, rules, added = play(config, policy, traced, progress)
     report = {
         "policy": config.policy,
@@ -137,7 +154,7 @@ Played = tuple[Evaluation, Callable[[], str], Rules, dict[str, Any]]
 def _play_kinematic(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool, progress: bool) -> Played:
     """All problems at once, on the batched rules."""
     rules = policy.rules
-    posed, noise = _posed(config, rules, "" if policy.any_cell else f"policy={policy.name}"), rules.config.noise
+    posed = _posed(config, rules, "" if policy.any_cell else f"policy={policy.name}")
     supervisors = [policy.under(_rules_in(each.cell, rules)) if each.own else policy for each in posed]
     traces = [Trace(supervisor.rules, each.numbers) for supervisor, each in zip(supervisors, posed, strict=True)]
     paths, timings = PathLengths(rules), math.ceil(TIMED_DECISIONS / len(posed))
@@ -154,21 +171,71 @@ def _play_kinematic(config: AssessmentConfig, policy: SupervisorPolicy, traced: 
                 )
             )
     result = joined(parts, [each.numbers for each in posed])
-    shown = {"noise": noise.report()} if rules.noisy or noise.observed else {}
-    return result, lambda: trace_text(traces), rules, {**shown, **paths.report(), **_repaired(supervisors)}
+    return result, lambda: trace_text(traces), rules, {**_noise(rules), **paths.report(), **_repaired(supervisors)}
+
+
+def _play_layouts(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool, progress: bool) -> Played:
+    """Problems in random cells, all cells of one number of arms at once, or one after the other if the policy acts in one cell only."""
+    wanted, rules = config.layouts, policy.rules
+    assert wanted is not None
+    if not policy.any_cell:
+        raise InvalidSetting(
+            "layouts", f"of {wanted.arms} arms", f"left out for policy={policy.name}, which acts in the one cell it is for"
+        )
+    if traced:
+        raise InvalidSetting("trace", "a file", "left out with layouts, whose cells no line could name")
+    _require_unpriced(rules, "random cells")
+    with Bar(total=wanted.count, unit="cell", shown=progress, leave=False) as bar:
+        found = problems_in_cells(wanted, wanted.count, rules.config, config.episodes, config.seed, lambda made: bar.update(1))
+    parts, unsolvable = {}, {arms: posed.unsolvable for arms, posed in found.items()}
+    solvable = {arms: posed for arms, posed in found.items() if len(posed.numbers)}
+    if not solvable:
+        raise WorkFailed(f"layouts: no plan solves any of {config.episodes} random problems; other layouts, or more episodes")
+    with Bar(total=sum(len(posed.numbers) for posed in solvable.values()), unit="episode", shown=progress, leave=False) as bar:
+        for arms, posed in solvable.items():
+            if policy.batch_of_cells:
+                parts[arms] = evaluate_in_cells(posed, lambda rules: policy.under(rules).act, config.seed, bar.update)
+            else:
+                parts[arms] = _one_by_one(policy, posed, config.seed, bar)
+    by_arms = {str(arms): {**part.report(), "unsolvable": unsolvable[arms]} for arms, part in parts.items()}
+    result = joined(list(parts.values()), [posed.numbers for posed in solvable.values()])
+    return result, str, rules, {**_noise(rules), "layouts": wanted.count, "unsolvable": sum(unsolvable.values()), "by_arms": by_arms}
+
+
+def _one_by_one(policy: SupervisorPolicy, posed: CellProblems, seed: int, bar: Bar) -> Evaluation:
+    """As :func:`evaluate_in_cells`, cell after cell."""
+    parts, numbers, timings = [], [], math.ceil(TIMED_DECISIONS / len(np.unique(posed.rules.cell.layout)))
+    for rules, rows in posed.layouts():
+        act, problems = policy.under(rules).act, (posed.start[rows], posed.goal[rows])
+        parts.append(evaluate(rules, act, problems, _seed_at(seed, int(posed.numbers[rows[0]])), None, bar.update, timings=timings))
+        numbers.append(rows)
+    return joined(parts, numbers)
+
+
+def _noise(rules: Rules) -> dict[str, Any]:
+    """What a report says of the noise that there is."""
+    return {"noise": rules.config.noise.report()} if rules.noisy or rules.config.noise.observed else {}
 
 
 def _rules_in(cell: Cell, rules: Rules) -> Rules:
     """The rule book of a cell that a problem brings."""
-    if rules.config.reward.motion_weight:
-        limit = "0 for problems with arms or obstacles of their own: no lengths of paths are known there"
-        raise InvalidSetting("task.reward.motion_weight", rules.config.reward.motion_weight, limit)
+    _require_unpriced(rules, "problems with arms or obstacles of their own")
     return Rules(cell, rules.config)
+
+
+def _require_unpriced(rules: Rules, what: str) -> None:
+    weight = rules.config.reward.motion_weight
+    if weight:
+        raise InvalidSetting("task.reward.motion_weight", weight, f"0 for {what}: no lengths of paths are known there")
 
 
 def _seed_of(seed: int, posed: PosedProblems) -> int:
     """Of noise: cells that problems bring draw others than the command's."""
-    return int(np.random.SeedSequence([seed, int(posed.numbers[0])]).generate_state(1)[0]) if posed.own else seed
+    return _seed_at(seed, int(posed.numbers[0])) if posed.own else seed
+
+
+def _seed_at(seed: int, first: int) -> int:
+    return int(np.random.SeedSequence([seed, first]).generate_state(1)[0])
 
 
 def _all_of(observers: Sequence[Observer]) -> Observer | None:

@@ -5,19 +5,22 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import islice
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from marl_handover.arrays import Floats, one_where
+from marl_handover.cell.batch import CellBatch, LayoutPool, random_layouts
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import ARM_LETTERS
+from marl_handover.config import LayoutConfig, TaskConfig
 from marl_handover.task.episode import Act, Decision, Episodes, Noise, Observer, conclude, play
-from marl_handover.task.planner import ExactPlanner
+from marl_handover.task.planner import ExactPlanner, optimal_transfers
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Command, Outcome, Rules, carried
 
@@ -25,6 +28,9 @@ EVALUATION_SEED = 1_000_000_000
 """Problems of reports come from seeds from here on; training and its validation use others, so these are never seen."""
 
 TIMED_DECISIONS = 1000
+TIMED_CELLS = 50
+"""Of a batch of cells, so many are timed in at most."""
+
 CHUNK = 1000
 
 
@@ -107,16 +113,100 @@ def evaluate(
         timings: how many decisions are timed at most.
     """
     started = time.perf_counter()
-    noise, seeing = placement_noise(rules, seed), mistaken(rules, act, seed)
+    noise, seeing = placement_noise(rules, seed), mistaken(rules, seed)(act)
     parts = []
     for first in range(0, len(problems[0]), CHUNK):
         start, goal = problems[0][first : first + CHUNK], problems[1][first : first + CHUNK]
         shifted = None if observer is None else _shifted(observer, first)
         parts.append(play(rules, seeing, start, goal, noise=noise, observer=shifted))
         progress(len(start))
-    episodes = Episodes(*(np.concatenate([part[index] for part in parts]) for index in range(3)))
     optimal = ExactPlanner(rules).plan(*problems).transfers
-    return Evaluation(episodes, optimal, decision_times_us(timed or act, problems, timings), time.perf_counter() - started)
+    return Evaluation(_in_a_row(parts), optimal, decision_times_us(timed or act, problems, timings), time.perf_counter() - started)
+
+
+class CellProblems(NamedTuple):
+    """Problems in random cells of one number of arms that can be solved.
+
+    Attributes:
+        rules: a batch of cells, one a problem.
+        numbers: (n,) which of all problems that were drawn these are.
+        start: (n, 3) mm, mm, rad.
+        goal: (n, 3).
+        optimal: (n,) fewest transfers.
+        unsolvable: how many problems of such cells were drawn that no plan solves.
+    """
+
+    rules: Rules
+    numbers: NDArray[np.int64]
+    start: Floats
+    goal: Floats
+    optimal: NDArray[np.int64]
+    unsolvable: int
+
+    def layouts(self) -> Iterator[tuple[Rules, NDArray[np.int64]]]:
+        """The rules of each cell by itself, and the rows (k,) of its problems."""
+        cells = self.rules.cell
+        for layout in np.unique(cells.layout):
+            yield Rules(cells.pool.cell(int(layout)), self.rules.config), np.nonzero(cells.layout == layout)[0]
+
+
+def problems_in_cells(
+    config: LayoutConfig, layouts: int, task: TaskConfig, count: int, seed: int, on_layout: Callable[[int], None] = lambda made: None
+) -> dict[int, CellProblems]:
+    """``count`` random problems of evaluation seed ``seed``, spread evenly over random cells, by the number of arms.
+
+    Args:
+        config: of the cells.
+        layouts: how many cells; one without a problem is drawn in vain.
+        task: what the problems are judged by.
+        count: of problems, those that no plan solves included.
+        seed: of cells and problems; trainings draw other ones.
+        on_layout: told how many cells are drawn.
+    """
+    drawn = random_layouts(config, layouts, np.random.default_rng(EVALUATION_SEED + seed), on_layout)
+    generator = torch.Generator().manual_seed(EVALUATION_SEED + seed)
+    layout = np.arange(count) * layouts // count
+    n_arms = np.array([len(arms) for arms, _ in drawn])
+    found = {}
+    for size in np.unique(n_arms[layout]).tolist():
+        own = np.nonzero(n_arms == size)[0]
+        numbers = np.nonzero(n_arms[layout] == size)[0]
+        pool = LayoutPool([drawn[index] for index in own], room=size)
+        rules = Rules(CellBatch(pool, np.searchsorted(own, layout[numbers])), task)
+        start, goal = (poses.numpy() for poses in sample_problems(rules.cell, len(numbers), generator))
+        optimal = optimal_transfers(rules, start, goal)
+        kept = optimal > 0
+        found[size] = CellProblems(rules.of_rows(kept), numbers[kept], start[kept], goal[kept], optimal[kept], int((~kept).sum()))
+    return found
+
+
+def evaluate_in_cells(
+    posed: CellProblems, under: Callable[[Rules], Act], seed: int = 0, progress: Callable[[int], object] = lambda done: None
+) -> Evaluation:
+    """Play problems in cells of their own, all at once, and time single decisions in single cells.
+
+    Args:
+        posed: the problems, at least one.
+        under: takes the rules of a batch of cells, or of one, and returns the policy that acts under them.
+        seed: of noise.
+        progress: called with the number of problems a chunk finished.
+    """
+    started = time.perf_counter()
+    noise, seeing = placement_noise(posed.rules, seed), mistaken(posed.rules, seed)
+    parts = []
+    for first in range(0, len(posed.numbers), CHUNK):
+        rows = slice(first, first + CHUNK)
+        start, goal = posed.start[rows], posed.goal[rows]
+        parts.append(play(posed.rules.of_rows(rows), lambda rules: seeing(under(rules)), start, goal, noise=noise))
+        progress(len(start))
+    cells = list(islice(posed.layouts(), TIMED_CELLS))
+    timings = math.ceil(TIMED_DECISIONS / len(cells))
+    times = [decision_times_us(under(rules), (posed.start[rows], posed.goal[rows]), timings) for rules, rows in cells]
+    return Evaluation(_in_a_row(parts), posed.optimal, np.concatenate(times), time.perf_counter() - started)
+
+
+def _in_a_row(parts: Sequence[Episodes]) -> Episodes:
+    return Episodes(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def joined(parts: Sequence[Evaluation], numbers: Sequence[NDArray[np.int64]]) -> Evaluation:
@@ -141,20 +231,23 @@ def placement_noise(rules: Rules, seed: int) -> Noise | None:
     return lambda count: generator.normal(size=(count, 3)) * scale
 
 
-def mistaken(rules: Rules, act: Act, seed: int) -> Act:
-    """``act`` as it decides about an object that it sees displaced, as the task's settings say; or itself."""
+def mistaken(rules: Rules, seed: int) -> Callable[[Act], Act]:
+    """What makes a policy decide about an object that it sees displaced, as the task's settings say; or leaves it as it is."""
     settings = rules.config.noise
     if not settings.observed:
-        return act
+        return lambda act: act
     scale = np.array([settings.observed_mm, settings.observed_mm, math.radians(settings.observed_deg)])
     generator = np.random.default_rng([seed, 1])  # other draws than those of placements
 
-    def seeing(pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
-        offset = generator.normal(size=pose.shape) * scale
-        seen: Floats = act(carried(pose, pose[..., :2] + offset[..., :2], offset[..., 2]), goal, previous_arm)
-        return seen
+    def misled(act: Act) -> Act:
+        def seeing(pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+            offset = generator.normal(size=pose.shape) * scale
+            seen: Floats = act(carried(pose, pose[..., :2] + offset[..., :2], offset[..., 2]), goal, previous_arm)
+            return seen
 
-    return seeing
+        return seeing
+
+    return misled
 
 
 def decision_times_us(act: Act, problems: tuple[Floats, Floats], most: int = TIMED_DECISIONS) -> Floats:

@@ -28,7 +28,7 @@ class GraphPolicy(SupervisorPolicy):
         about: what the file says of them.
     """
 
-    any_cell = True
+    any_cell = batch_of_cells = True
 
     def __init__(self, rules: Rules, name: str, arrays: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> None:
         super().__init__(rules, name)

@@ -44,6 +44,7 @@ class SupervisorPolicy(ABC):
 
     variant = "hierarchical"
     any_cell = False  # whether it acts in any other cell, too, once it is under that one's rule book
+    batch_of_cells = False  # whether it acts in many cells at once, too, one a row
 
     def __init__(self, rules: Rules, name: str) -> None:
         self.rules, self.name = rules, name
