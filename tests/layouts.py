@@ -47,3 +47,17 @@ def model_of(count, layout=ring):
     if key not in MODELS:
         MODELS[key] = build_cell(replace(CellConfig(name="many", grid_mm=10.0, chart="angle"), arms=layout(count)))
     return MODELS[key]
+
+
+def moved(arms, discs, poses, angle, shift, flip):
+    """Layout and poses after a reflection of the table (y -> -y) if ``flip`` says so, then a turn and a shift."""
+    arms, discs, poses = arms.copy(), discs.copy(), [pose.copy() for pose in poses]
+    cos, sin = math.cos(angle), math.sin(angle)
+    sign = -1.0 if flip else 1.0
+    for points in (arms[:, :2], discs[:, :2], *(pose[:, :2] for pose in poses)):
+        points[:] = np.stack([cos * points[:, 0] - sin * sign * points[:, 1], sin * points[:, 0] + cos * sign * points[:, 1]], -1) + shift
+    for directions in (arms[:, 2], *(pose[:, 2] for pose in poses)):
+        directions[:] = sign * directions + angle
+    if flip:
+        arms[:, 5:7] = -arms[:, [6, 5]]
+    return arms, discs, poses

@@ -1,7 +1,5 @@
 """A batch of cells is each of its cells, row by row: reach, places, steps, observations; and what the ``graph`` layout does not see."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -15,6 +13,7 @@ from marl_handover.task.graph_observation import ARM_FIELDS, ODD_ARM_FIELDS, ODD
 from marl_handover.task.observations import observation_size, observe
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Rules
+from tests.layouts import moved
 
 MIXED = LayoutConfig(arms=[3, 6], r_min_mm=[120.0, 160.0], r_max_mm=[215.0, 260.0], yaw_deg=[90.0, 132.0], obstacles=[0, 3])
 CLOSE = LayoutConfig(arms=[3, 4], spacing_mm=[80.0, 200.0], apart_mm=70.0)
@@ -108,20 +107,6 @@ def test_the_environment_draws_a_layout_for_each_episode(pool, layout):
     env.reset()
     again = SupervisorEnv(32, task=TaskConfig(layout=layout), layouts=pool, seed=0).rollout(1)
     assert torch.equal(first["observation"][:, 0], again["observation"][:, 0])
-
-
-def moved(arms, discs, poses, angle, shift, flip):
-    """Layout and poses after a turn, a shift and, first, a reflection of the table (y -> -y)."""
-    arms, discs, poses = arms.copy(), discs.copy(), [pose.copy() for pose in poses]
-    cos, sin = math.cos(angle), math.sin(angle)
-    sign = -1.0 if flip else 1.0
-    for points in (arms[:, :2], discs[:, :2], *(pose[:, :2] for pose in poses)):
-        points[:] = np.stack([cos * points[:, 0] - sin * sign * points[:, 1], sin * points[:, 0] + cos * sign * points[:, 1]], -1) + shift
-    for directions in (arms[:, 2], *(pose[:, 2] for pose in poses)):
-        directions[:] = sign * directions + angle
-    if flip:
-        arms[:, 5:7] = -arms[:, [6, 5]]
-    return arms, discs, poses
 
 
 def blocks(arms, discs, poses, order=None):
