@@ -43,6 +43,7 @@ __all__ = [
     "LoopConfig",
     "MotionConfig",
     "NoiseConfig",
+    "OutageConfig",
     "RewardConfig",
     "RobotConfig",
     "TaskChanges",
@@ -372,6 +373,17 @@ class LoopConfig:
         check_bounds(self, "loop.")
         if self.transfers < max_steps:
             raise InvalidSetting("loop.transfers", self.transfers, f"at least task.max_steps = {max_steps}")
+
+
+@dataclass
+class OutageConfig:
+    """An arm that goes out of order in the middle of each episode: from the next decision on, the cell is that of the other arms."""
+
+    arm: str = "random"  # its name; random: any, drawn for each problem
+    after: int | None = bounded(
+        None, 0, 1000
+    )  # transfers that are made before; null: drawn, from 1 up to before the last of a shortest plan
+    seed: int = seed_field()
 
 
 @dataclass

@@ -13,13 +13,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from marl_handover.arrays import Array, Floats, as_kind, kind_of, namespace, one_where
 from marl_handover.cell.arm import PAIR_NAMES, REACH_TOLERANCE_MM, Arm, Disc, lateral_rad
 from marl_handover.cell.chart import Chart, PaperChart
 from marl_handover.cell.sectors import Sectors, sector_limits
 from marl_handover.cell.shared_space import HandoverGraph, SharedSpace
-from marl_handover.cell.symmetry import ARM_LETTERS, Symmetry, View, pair_views, symmetries
+from marl_handover.cell.symmetry import ARM_LETTERS, NO_ARM, Symmetry, View, pair_views, symmetries
 from marl_handover.config import CellConfig, require_choice
 from marl_handover.errors import BlockedPlace, InvalidSetting, OutOfReach, TwoArmsOnly, UnconnectedArms, UnequalArms
 from marl_handover.geometry.se2 import SE2
@@ -64,13 +65,7 @@ class Cell(Sectors):
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """What traces and pictures call the arms: L and R in a mirrored pair, else by name."""
-        return self.names if self.config.arms else tuple(ARM_LETTERS[number] for number in self.numbers)
-
-    @cached_property
-    def numbers(self) -> tuple[int, ...]:
-        """Which arm of the whole cell each one is; they count from 0 without a gap unless arms are out of order."""
-        whole = [arm.name for arm in self.config.arms] or PAIR_NAMES
-        return tuple(whole.index(name) for name in self.names) if self.config.enabled else tuple(range(self.num_arms))
+        return self.names if self.config.arms else tuple(ARM_LETTERS[PAIR_NAMES.index(name)] for name in self.names)
 
     @cached_property
     def bases(self) -> tuple[SE2, ...]:
@@ -241,7 +236,7 @@ class Cell(Sectors):
         """The cell while only the arms ``names`` are in order: the graph without the others. All of them: the cell itself.
 
         They keep their order, their places and what any two share. They may be a single arm, and need not be able to pass to each other.
-        :attr:`numbers` says which arms of the whole cell they are.
+        They are counted anew: :meth:`numbered`.
 
         Raises:
             UnknownChoice, InvalidSetting: no arm has a name, one comes twice, or there is none.
@@ -256,6 +251,14 @@ class Cell(Sectors):
         if len(left) == self.num_arms:
             return self
         return replace(self, arms=left, config=replace(self.config, enabled=[arm.name for arm in left]))
+
+    def numbered(self, arm: ArrayLike, cell: Cell) -> NDArray[np.int64]:
+        """Indices (...) here of the arms that have the indices ``arm`` (...) in ``cell``, which has other arms of the same cell in order.
+
+        NO_ARM stays, and is what one that is out of order here becomes.
+        """
+        here = [self.names.index(name) if name in self.names else NO_ARM for name in cell.names]
+        return np.array([*here, NO_ARM])[np.asarray(arm)]
 
     def with_inset(self, chart_inset: float) -> Cell:
         """The same cell with another part of the chart in use."""

@@ -70,6 +70,7 @@ def table(report: dict[str, Any], result: Evaluation) -> str:
         lines.append(f"{steps:<22}{rows.sum():>12}{100 * solved[rows].mean():>11.2f}%{result.episodes.transfers[rows].mean():>12.3f}")
     lines += _lines_by_arms(report) if "by_arms" in report else []
     lines += ["", outcomes, f"one decision: p50 {report['decision_us']['p50']:.0f} us, p99 {report['decision_us']['p99']:.0f} us"]
+    lines += _outage_lines(report["outage"]) if "outage" in report else []
     return "\n".join(lines + (_loop_lines(report) if "success_in_the_end" in report else []))
 
 
@@ -81,6 +82,16 @@ def _lines_by_arms(report: dict[str, Any]) -> list[str]:
         lines.append(f"{arms:22}{part['episodes']:>12}{success}{ratio}{part['decision_us']['p50']:>12.0f}")
     drawn = counted(report["layouts"], "random cell")
     return [*lines, "", f"{drawn}; problems that no plan solves, left out: {report['unsolvable']}"]
+
+
+def _outage_lines(outage: dict[str, Any]) -> list[str]:
+    """What became of episodes in which an arm went out of order."""
+    share = "" if outage["solved_share"] is None else f" ({100 * outage['solved_share']:.2f} %)"
+    return [
+        "",
+        f"an arm went out of order in {counted(outage['episodes'], 'episode')}: {outage['solvable']} stayed solvable, "
+        f"{outage['solved']} of these were solved{share}; the goals of the other {outage['unreachable']} cannot be reached any more",
+    ]
 
 
 def _loop_lines(report: dict[str, Any]) -> list[str]:

@@ -16,6 +16,7 @@ import numpy as np
 from marl_handover.arrays import Floats
 from marl_handover.cell import NO_ARM, build_cell
 from marl_handover.config import LoopConfig, MotionConfig
+from marl_handover.control.outage import Outage, policy_without
 from marl_handover.control.transfers import (
     SAME_MM,
     SAME_RAD,
@@ -32,7 +33,7 @@ from marl_handover.motion.executor import ROLL_RAD
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.motion.trajectory import OutOfArmsReach, TransferMotion
-from marl_handover.policies import SupervisorPolicy
+from marl_handover.policies import ResigningPolicy, SupervisorPolicy
 from marl_handover.task.episode import conclude, final_transfer, measured_verdict, nobody_moves
 from marl_handover.task.rules import Outcome, Rules, Verdict
 
@@ -87,7 +88,9 @@ class _Run:
 
     goal: Floats
     pose: Floats
+    policy: SupervisorPolicy
     previous: int = NO_ARM
+    lost_at: int | None = None
     attempt: int = 0
     ended: str | None = None
     transfers: list[Transfer] = field(default_factory=list)
@@ -100,11 +103,11 @@ class ClosedLoop:
     ``max_steps`` transfers at the latest. A transfer that the arm or the backend refuses is a wrong position. After any other verdict than
     success the loop tries again, with the object where it lies, until the object is at the goal or ``settings.transfers`` are spent. It is
     *stuck* if the object has tipped over or stays out of sight, if an arm does nothing time and again, or if a command is refused and then
-    given again about an object that has not moved.
+    given again about an object that has not moved. With arms out of order it ends *unreachable* where the others cannot solve it any more.
 
     Args:
-        policy: the supervisor, under the rules that judge it.
-        planner: of the arms' motions.
+        policy: the supervisor, under the rules that judge it; its cell may be that of some of the arms.
+        planner: of the motions of all arms; those out of order stand in their way.
         backend: what carries them out.
         settings: limits of the loop.
 
@@ -114,7 +117,7 @@ class ClosedLoop:
 
     def __init__(self, policy: SupervisorPolicy, planner: MotionPlanner, backend: Backend, settings: LoopConfig | None = None) -> None:
         self.policy, self.planner, self.backend, self.settings = policy, planner, backend, settings or LoopConfig()
-        self.rules: Rules = policy.rules
+        self.rules: Rules = _whole(policy.rules, planner)
         self.settings.validate(self.rules.config.max_steps)
         self.limit = self.settings.transfers
         self._same = backend.same if isinstance(backend, TracksObject) else (SAME_MM, SAME_RAD)
@@ -128,7 +131,13 @@ class ClosedLoop:
         self.backend.close()
 
     def play(
-        self, start: Floats, goal: Floats, seed: int = 0, observer: Observer | None = None, goals: Callable[[], Floats] | None = None
+        self,
+        start: Floats,
+        goal: Floats,
+        seed: int = 0,
+        observer: Observer | None = None,
+        goals: Callable[[], Floats] | None = None,
+        outage: Outage | None = None,
     ) -> Episode:
         """One problem, start and goal (3,) in mm and rad, to its end.
 
@@ -138,18 +147,25 @@ class ClosedLoop:
             seed: of the backend.
             observer: is shown every transfer once it is judged.
             goals: the goal at present, asked before every decision and at the end; a transfer under way when it changes is finished.
+            outage: an arm that goes out of order.
+
+        Raises:
+            InvalidSetting: of an outage, as :func:`~marl_handover.control.outage.policy_without`.
         """
         begun = time.perf_counter()
-        run = _Run(np.asarray(goal, float), self.backend.reset(np.asarray(start, float), seed))
+        left = self.policy if outage is None else policy_without(self.policy, outage.arm)
+        run = _Run(np.asarray(goal, float), self.backend.reset(np.asarray(start, float), seed), self.policy)
         while self._goes_on(run, goals):
             first = len(run.transfers)
+            if outage is not None and run.lost_at is None and first >= outage.after:
+                run.policy, run.lost_at = left, first
             self._decide(run)
             if run.ended is None:
                 self._conclude(run)
             if observer is not None:
                 for transfer in run.transfers[first:]:
                     observer(transfer)
-        return Episode(run.goal, tuple(run.transfers), str(run.ended), time.perf_counter() - begun)
+        return Episode(run.goal, tuple(run.transfers), str(run.ended), time.perf_counter() - begun, run.lost_at)
 
     def _goes_on(self, run: _Run, goals: Callable[[], Floats] | None) -> bool:
         """Take up a new goal, and an object that somebody moved; whether there is anything left to do."""
@@ -180,41 +196,49 @@ class ClosedLoop:
 
     def _command(self, run: _Run) -> None:
         """Ask the policy and have its command carried out."""
-        rules, seen = self.rules, self._seen(run)
-        action = self.policy.act(seen, run.goal, np.asarray(run.previous))
+        rules, seen = run.policy.rules, self._seen(run)
+        action = run.policy.act(seen, run.goal, rules.cell.numbered(run.previous, self.rules.cell))
         if bool(nobody_moves(action)):
             self._wait(run)
             return
-        command = transfer_command(rules, seen, run.goal, action)
+        told = transfer_command(rules, seen, run.goal, action)
+        command = self._numbered(told, rules)
         result = self._move(run.pose, command, seen)
         verdict = measured_verdict(rules, result.pose, run.goal, np.bool_(command.final), np.bool_(result.tried))
         if rules.external_finish and command.feasible and not result.tried:
             # A command that the rule book forbids costs a transfer, as on exact arms; an arm that refuses ends the attempt.
             verdict = REFUSED
-        penalty = rules.motion_penalty(np.int64(command.arm), run.pose, result.pose)
+        penalty = rules.motion_penalty(np.int64(told.arm), run.pose, result.pose)
         self._record(run, command, result, verdict._replace(reward=verdict.reward - penalty))
 
     def _wait(self, run: _Run) -> None:
         """No arm is to move, now or later: a time-out. The entry has a command to nobody, which nobody carried out."""
         command = TransferCommand(max(int(run.previous), 0), False, np.zeros(2), run.pose[:2], run.pose, False)
-        result = TransferResult(run.pose, Refusal.DECLINED, "the policy wants no arm to move")
+        why = run.policy.unsolvable_because(self._seen(run), run.goal) if isinstance(run.policy, ResigningPolicy) else ""
+        result = TransferResult(run.pose, Refusal.DECLINED, why or "the policy wants no arm to move")
         self._record(run, command, result, Verdict(np.float64(0), np.bool_(False), np.int64(Outcome.NONE)))
         run.transfers[-1] = replace(run.transfers[-1], truncated=True, outcome=Outcome.TIMEOUT)
-        run.ended = "stuck"
+        run.ended = "unreachable" if why else "stuck"
 
     def _finish(self, run: _Run) -> bool:
         """Architecture A's final transfer, if an arm can do it; whether it was commanded."""
         seen = self._seen(run)
-        command = finish_command(self.rules, seen, run.goal)
-        if command is None:
+        finish = finish_command(run.policy.rules, seen, run.goal)
+        if finish is None:
             return False
+        command = self._numbered(finish, run.policy.rules)
         result = self._move(run.pose, command, seen)
         verdict = self.rules.external_verdict(result.pose, run.goal, np.int64(command.arm)) if result.tried else REFUSED
         self._record(run, command, result, verdict)
         return True
 
     def _seen(self, run: _Run) -> Floats:
-        return self.rules.cell.clamp_to_workspace(run.pose, self.settings.reach_slack_mm)
+        return run.policy.rules.cell.clamp_to_workspace(run.pose, self.settings.reach_slack_mm)
+
+    def _numbered(self, command: TransferCommand, rules: Rules) -> TransferCommand:
+        """A command under the rules of some of the arms, its arms counted as all are."""
+        arm, receiver = (int(number) for number in self.rules.cell.numbered([command.arm, command.receiver], rules.cell))
+        return command._replace(arm=arm, receiver=receiver)
 
     @staticmethod
     def _record(run: _Run, command: TransferCommand, result: TransferResult, verdict: Verdict) -> None:
@@ -282,13 +306,26 @@ class ClosedLoop:
         return int(verdict.outcome) == Outcome.SUCCESS
 
 
+def _whole(rules: Rules, planner: MotionPlanner) -> Rules:
+    """The rules of all arms."""
+    whole = planner.model.cell
+    if rules.cell.config.enabled is None:
+        return rules
+    return Rules(whole.with_inset(rules.cell.config.chart_inset), rules.config, rules.motion_cost, physical=rules.measured)
+
+
 def transfer_command(rules: Rules, pose: Floats, goal: Floats, action: Floats) -> TransferCommand:
-    """What a supervisor's ``action`` (4,) tells an arm to do with an object at ``pose`` (3,), goal (3,)."""
+    """What a supervisor's ``action`` (size,) tells an arm to do with an object at ``pose`` (3,), goal (3,).
+
+    A place in what two arms share that share nothing is where the object lies.
+    """
     command = rules.decode(action)
     predicted, feasible = rules.transfer(pose, goal, command)
-    chart = np.array(rules.cell.shared.from_table(command.place_mm), float)
-    target = goal[:2] if command.final else command.place_mm
-    return TransferCommand(int(command.arm), bool(command.final), chart, target, predicted, bool(feasible))
+    arm, receiver = int(command.arm), int(command.receiver)
+    space = rules.cell.graph.edges.get((min(arm, receiver), max(arm, receiver)))
+    chart = np.zeros(2) if space is None else np.array(space.from_table(command.place_mm), float)
+    target = goal[:2] if command.final else pose[:2] if space is None else command.place_mm
+    return TransferCommand(arm, bool(command.final), chart, target, predicted, bool(feasible), receiver)
 
 
 def finish_command(rules: Rules, pose: Floats, goal: Floats) -> TransferCommand | None:
@@ -300,7 +337,7 @@ def finish_command(rules: Rules, pose: Floats, goal: Floats) -> TransferCommand 
 def make_loop(
     policy: SupervisorPolicy, backend: str, motion: MotionConfig | None = None, settings: LoopConfig | None = None, **options: Any
 ) -> ClosedLoop:
-    """A closed loop around a policy, in the policy's own cell.
+    """A closed loop around a policy, in the policy's own cell; arms that are out of order there stand in it.
 
     Transfers are priced as these arms move. On arms that are not exact, placements are judged with their tolerance, and the hand-overs
     keep away from the edge of the shared space: ``settings.chart_inset``, or the backend's own if that is smaller.
@@ -317,12 +354,14 @@ def make_loop(
     """
     motion, settings = motion or MotionConfig(), settings or LoopConfig()
     settings.validate(policy.rules.config.max_steps)
-    model = build_cell(policy.rules.cell.config)
+    enabled = policy.rules.cell.config.enabled
+    model = build_cell(replace(policy.rules.cell.config, enabled=None))
     planner = MotionPlanner(model, motion)
     planner.warm_up()
     made = make_backend(backend, model, policy.rules.config, motion, **options)
     inset = min(settings.chart_inset, model.cell.config.chart_inset, made.chart_inset if isinstance(made, HasChartInset) else 1.0)
     cell = model.cell if made.exact else model.cell.with_inset(inset)
+    cell = cell if enabled is None else cell.with_arms(enabled)
     price = motion_cost(cell, policy.rules.config, motion)
     rules = Rules(cell, policy.rules.config, price, physical=not made.exact)
     return ClosedLoop(policy.under(rules), planner, made, settings)

@@ -6,7 +6,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -25,6 +25,7 @@ from marl_handover.config import (
     LayoutConfig,
     LoopConfig,
     MotionConfig,
+    OutageConfig,
     TaskChanges,
     bounded,
     changed,
@@ -33,6 +34,7 @@ from marl_handover.config import (
     path_field,
     seed_field,
 )
+from marl_handover.control.outage import Outage, OutageRun, Outages, Struck, draw_outages, policy_without, total
 from marl_handover.envs.centralised import CentralisedRules, MotionCommand
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.errors import InvalidSetting, WorkFailed
@@ -51,7 +53,7 @@ from marl_handover.learning.evaluation import (
     trace_text,
 )
 from marl_handover.motion.path_length_table import known_table
-from marl_handover.policies import ShieldedPolicy, SupervisorPolicy
+from marl_handover.policies import ResigningPolicy, ShieldedPolicy, SupervisorPolicy
 from marl_handover.progress import Bar
 from marl_handover.task.episode import Decision, Episodes, Observer
 from marl_handover.task.planner import ExactPlanner
@@ -93,6 +95,7 @@ class AssessmentConfig:
     calibration: str | None = path_field(None)  # of twin: folder of its calibration; null: runs/calibration/twin
     hardware: HardwareConfig | None = None  # of twin: single keys change its electronics; ports are always the emulated ones
     problems: str = path_field()  # JSON Lines of problems instead of random ones
+    outage: OutageConfig | None = None  # an arm that goes out of order in mid-episode; null: none does
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on what can be refused without playing."""
@@ -158,20 +161,25 @@ def _play_kinematic(config: AssessmentConfig, policy: SupervisorPolicy, traced: 
     supervisors = [policy.under(_rules_in(each.cell, rules)) if each.own else policy for each in posed]
     traces = [Trace(supervisor.rules, each.numbers) for supervisor, each in zip(supervisors, posed, strict=True)]
     paths, timings = PathLengths(rules), math.ceil(TIMED_DECISIONS / len(posed))
-    parts = []
+    runs: list[OutageRun] = []
+    if config.outage is not None:
+        rows = zip(supervisors, posed, traces, strict=True)
+        runs = [OutageRun(each, of, config.outage, _seed_of(config.seed, of), trace if traced else None) for each, of, trace in rows]
     with _bar(posed, progress) as bar:
-        for each, supervisor, trace in zip(posed, supervisors, traces, strict=True):
+        parts = [run.evaluate(bar.update, timings) for run in runs]
+        for each, supervisor, trace in zip(posed, supervisors, traces, strict=True) if not runs else ():
             observers: list[Observer] = [*([] if each.own else [paths]), *([trace] if traced else [])]
             # What is timed is a copy, which counts its repairs by itself.
             timed = supervisor if each.own and not isinstance(supervisor, ShieldedPolicy) else supervisor.under(supervisor.rules)
             seed = _seed_of(config.seed, each)
-            parts.append(
-                evaluate(
-                    supervisor.rules, supervisor.act, (each.start, each.goal), seed, _all_of(observers), bar.update, timed.act, timings
-                )
-            )
+            problems = each.start, each.goal
+            parts.append(evaluate(supervisor.rules, supervisor.act, problems, seed, _all_of(observers), bar.update, timed.act, timings))
     result = joined(parts, [each.numbers for each in posed])
-    return result, lambda: trace_text(traces), rules, {**_noise(rules), **paths.report(), **_repaired(supervisors)}
+    shown: dict[str, Any] = {}
+    if config.outage is not None:
+        shown["outage"] = total(run.struck for run in runs).report(config.outage)
+        supervisors += [rest.inner for run in runs for rest in run.rest.values()]
+    return result, lambda: trace_text(traces), rules, {**_noise(rules), **shown, **paths.report(), **_repaired(supervisors)}
 
 
 def _play_layouts(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool, progress: bool) -> Played:
@@ -182,6 +190,8 @@ def _play_layouts(config: AssessmentConfig, policy: SupervisorPolicy, traced: bo
         raise InvalidSetting(
             "layouts", f"of {wanted.arms} arms", f"left out for policy={policy.name}, which acts in the one cell it is for"
         )
+    if config.outage is not None:
+        raise InvalidSetting("outage", config.outage.arm, "left out with layouts; problems=FILE takes cells of its own")
     if traced:
         raise InvalidSetting("trace", "a file", "left out with layouts, whose cells no line could name")
     _require_unpriced(rules, "random cells")
@@ -256,21 +266,25 @@ def _play_loop(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool,
     started = time.perf_counter()
     options = backend_options(config)
     with make_loop(policy, config.backend, config.motion, config.loop, **options) as loop:
-        rules, backend = loop.rules, loop.backend
+        rules, decides, backend = loop.rules, loop.policy.rules, loop.backend
         for note in getattr(backend, "notes", ()):
             print(note, file=sys.stderr)
-        posed = _posed(config, rules, f"backend={config.backend}")
+        posed = _posed(config, decides, f"backend={config.backend}")
         problems = posed[0].start, posed[0].goal
+        optimal = ExactPlanner(decides).plan(*problems).transfers
+        outages = None if config.outage is None else draw_outages(config.outage, decides.cell, optimal, posed[0].numbers)
+        without = {} if outages is None else {int(arm): policy_without(loop.policy, int(arm)) for arm in np.unique(outages.arm)}
         with _bar(posed, progress) as bar:
-            played = play_problems(loop, problems, config.seed, bar.update)
+            played = play_problems(loop, problems, config.seed, bar.update, outages)
     outcomes, steps = (np.array(values) for values in zip(*((int(true_outcome(e, rules)), len(e.first)) for e in played), strict=True))
     episodes = Episodes(outcomes, steps, np.stack([episode.first[-1].result.pose for episode in played]))
-    optimal = ExactPlanner(rules).plan(*problems).transfers
-    result = Evaluation(episodes, optimal, decision_times_us(loop.policy.under(rules).act, problems), time.perf_counter() - started)
+    result = Evaluation(episodes, optimal, decision_times_us(loop.policy.under(decides).act, problems), time.perf_counter() - started)
     own = (
         {"noise": backend.noise.report(), "missed_grasps": backend.missed_grasps} if isinstance(backend, NoisyBackend) else _shown(options)
     )
     settings = {"chart_inset": rules.cell.config.chart_inset, "position_tolerance_mm": rules.config.position_tolerance_mm, **own}
+    if config.outage is not None and outages is not None:
+        settings["outage"] = _struck(played, outages, without, rules).report(config.outage)
     return result, lambda: loop_trace_text(played, rules), rules, {**loop_report(played, rules), **settings, **_repaired([loop.policy])}
 
 
@@ -316,15 +330,32 @@ def backend_options(config: AssessmentConfig) -> dict[str, Any]:
 
 
 def play_problems(
-    loop: ClosedLoop, problems: tuple[Floats, Floats], seed: int, progress: Callable[[int], object] = lambda result: None
+    loop: ClosedLoop,
+    problems: tuple[Floats, Floats],
+    seed: int,
+    progress: Callable[[int], object] = lambda result: None,
+    outages: Outages | None = None,
 ) -> list[Episode]:
     """Play all problems, starts and goals (n, 3), in order; ``seed`` and the episode's number decide all that is random in it."""
     episodes = []
     for number, (start, goal) in enumerate(zip(*problems, strict=True)):
         episode_seed = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-        episodes.append(loop.play(start, goal, episode_seed))
+        outage = None if outages is None else Outage(int(outages.arm[number]), int(outages.after[number]))
+        episodes.append(loop.play(start, goal, episode_seed, outage=outage))
         progress(1)
     return episodes
+
+
+def _struck(episodes: Sequence[Episode], outages: Outages, without: Mapping[int, ResigningPolicy], rules: Rules) -> Struck:
+    """What became of the loop's episodes in which an arm failed; what could be solved then is told by where the object was measured."""
+    struck = solvable = solved = 0
+    for episode, arm in zip(episodes, outages.arm, strict=True):
+        if episode.lost_at is None:
+            continue
+        struck, left, begun = struck + 1, without[int(arm)], episode.transfers[episode.lost_at]
+        if not left.unsolvable_because(left.rules.cell.clamp_to_workspace(begun.before, LoopConfig.reach_slack_mm), begun.goal):
+            solvable, solved = solvable + 1, solved + truly_solved(episode, rules)
+    return Struck(struck, solvable, solved)
 
 
 def loop_report(episodes: Sequence[Episode], rules: Rules) -> dict[str, Any]:

@@ -263,7 +263,7 @@ class SessionState:
 
     def __init__(self, loop: ClosedLoop, backend: HardwareBackend, command_queue: CommandQueue) -> None:
         self.digest, self.backend, self._desk = SessionDigest(), backend, command_queue
-        self._policy = deepcopy(loop.policy)
+        self._policy, self._whole = deepcopy(loop.policy), loop.rules.cell
         """Of its own: asking the session's would change what one that draws lots does next."""
         self._reach_slack_mm = loop.settings.reach_slack_mm
         self._about: dict[str, Any] = {"architecture": loop.rules.config.architecture}
@@ -362,7 +362,7 @@ class SessionState:
             return
         try:
             start = self._policy.rules.cell.clamp_to_workspace(np.array(digest.pose, float), self._reach_slack_mm)
-            self._plan = rollout(self._policy, start, goal, digest.previous_arm)
+            self._plan = rollout(self._policy, start, goal, digest.previous_arm, self._whole)
         except HandoverError:
             return  # a policy that has nothing to say of this will say so in the session
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from marl_handover.arrays import Floats, wrap
-from marl_handover.cell.symmetry import ARM_LETTERS
+from marl_handover.cell import Cell
+from marl_handover.cell.symmetry import ARM_LETTERS, NO_ARM
 from marl_handover.envs.cycle_check import FAILURES
 from marl_handover.learning.evaluation import judged_by
 from marl_handover.policies import SupervisorPolicy
@@ -67,6 +68,7 @@ class TransferCommand(NamedTuple):
         place_mm: (2,) where the object is to go.
         predicted: (3,) where the rule book says that exact arms leave it.
         feasible: whether the rule book lets the arm do it.
+        receiver: index of the arm that shares the place; -1 if there is none.
     """
 
     arm: int
@@ -75,6 +77,7 @@ class TransferCommand(NamedTuple):
     place_mm: Floats
     predicted: Floats
     feasible: bool
+    receiver: int = NO_ARM
 
 
 @dataclass(frozen=True)
@@ -124,14 +127,16 @@ class Episode:
     Attributes:
         goal: (3,), the last one if it was changed.
         transfers: in order.
-        ended: ``success``, ``transfers`` (none left) or ``stuck``.
+        ended: ``success``, ``transfers`` (none left), ``stuck`` or, with arms out of order, ``unreachable``.
         wall_s: wall-clock time it took.
+        lost_at: transfers that were made when an arm went out of order; None: none did.
     """
 
     goal: Floats
     transfers: tuple[Transfer, ...]
     ended: str
     wall_s: float
+    lost_at: int | None = None
 
     @property
     def first(self) -> tuple[Transfer, ...]:
@@ -161,12 +166,14 @@ def trace_text(episodes: Sequence[Episode], rules: Rules) -> str:
 
 def transfer_row(transfer: Transfer, rules: Rules) -> dict[str, Any]:
     """One line: the fields of a kinematic trace with measured poses, and what only a motion has."""
-    command, result = transfer.command, transfer.result
+    command, result, labels = transfer.command, transfer.result, rules.cell.labels
+    receiver = None if command.final or command.receiver < 0 else labels[command.receiver]
     return {
         "state": transfer.before.tolist(),
         "goal": transfer.goal.tolist(),
-        "previous_arm": ARM_LETTERS[transfer.previous_arm] if transfer.previous_arm >= 0 else None,
-        "arm": ARM_LETTERS[command.arm],
+        "previous_arm": labels[transfer.previous_arm] if transfer.previous_arm >= 0 else None,
+        "arm": labels[command.arm],
+        **({} if labels == ARM_LETTERS else {"receiver": receiver}),
         "final": command.final,
         "place": command.place_mm.tolist(),
         "alpha": float(command.chart[0]),
@@ -194,7 +201,7 @@ class Placement(NamedTuple):
     final: bool
 
 
-def rollout(policy: SupervisorPolicy, pose: ArrayLike, goal: ArrayLike, previous_arm: int) -> list[Placement]:
+def rollout(policy: SupervisorPolicy, pose: ArrayLike, goal: ArrayLike, previous_arm: int, whole: Cell | None = None) -> list[Placement]:
     """The transfers that ``policy`` orders if arms are exact, as many as an episode allows at most.
 
     Args:
@@ -202,9 +209,11 @@ def rollout(policy: SupervisorPolicy, pose: ArrayLike, goal: ArrayLike, previous
         pose: of the object (3,), in mm and rad.
         goal: where it is to go (3,).
         previous_arm: index of the arm that moved last, -1 for none.
+        whole: the cell whose arms are counted, if some of them are out of order; else the policy's own.
     """
     rules, here, there = policy.rules, np.asarray(pose, float), np.asarray(goal, float)
-    previous = np.int64(previous_arm)
+    cell = rules.cell if whole is None else whole
+    previous = rules.cell.numbered(previous_arm, cell)
     ahead: list[Placement] = []
     over = False
     while not over:
@@ -215,9 +224,10 @@ def rollout(policy: SupervisorPolicy, pose: ArrayLike, goal: ArrayLike, previous
             break
         external = int(result.external_arm)
         if bool(result.feasible):
-            ahead.append(Placement(np.array(result.placed, float), int(result.command.arm), bool(result.command.final)))
+            arm = int(cell.numbered(result.command.arm, rules.cell))
+            ahead.append(Placement(np.array(result.placed, float), arm, bool(result.command.final)))
         if external >= 0:
-            ahead.append(Placement(np.array(result.pose, float), external, True))
+            ahead.append(Placement(np.array(result.pose, float), int(cell.numbered(external, rules.cell)), True))
         if not (bool(result.feasible) or external >= 0):
             break
         here, previous = np.asarray(result.pose, float), result.previous_arm

@@ -112,7 +112,9 @@ def open_workcell(
         MissingFile, CorruptFile, CalibrationProblem, CalibrationMismatch: ``calibrate`` has to be run first, or again.
         NoCamera: the camera is not there.
         InvalidSetting, UnknownChoice: a setting is out of its limits.
+        TwoArmsOnly: the cell has another number of arms.
     """
+    model.cell.require_pair("the hardware driver")
     folder = config.folder()
     seen_by = camera_calibration(folder)
     own = [arm_file(arm) for arm in ARMS if not (arm in config.hardware.arms and config.hardware.arms[arm].calibration)]

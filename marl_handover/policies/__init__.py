@@ -2,7 +2,7 @@
 
 from marl_handover.policies.actor import NetworkPolicy
 from marl_handover.policies.files import read_policy, stored_settings
-from marl_handover.policies.policy import ShieldedPolicy, SupervisorPolicy
+from marl_handover.policies.policy import ResigningPolicy, ShieldedPolicy, SupervisorPolicy
 from marl_handover.policies.registry import POLICIES, ExactPolicy, GreedyPolicy, RandomPolicy, adapted, load, names
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "GreedyPolicy",
     "NetworkPolicy",
     "RandomPolicy",
+    "ResigningPolicy",
     "ShieldedPolicy",
     "SupervisorPolicy",
     "adapted",

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.arrays import Floats
-from marl_handover.errors import WorkFailed
+from marl_handover.errors import WorkFailed, listed
 from marl_handover.task.actions import action_of, choices_of
+from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Outcome, Rules
 
 SHIELDED = "shielded:"
@@ -155,3 +156,41 @@ class ShieldedPolicy(SupervisorPolicy):
             return np.asarray(~(feasible | rules.can_finish(pose, goal).any(-1)))
         outcome = rules.judge(placed, goal, command.final, feasible).outcome
         return np.asarray((outcome == int(Outcome.WRONG_ORIENTATION)) | (outcome == int(Outcome.WRONG_POSITION)))
+
+
+class ResigningPolicy(SupervisorPolicy):
+    """Another policy, for a cell with arms out of order: it says so when the goal cannot be reached any more.
+
+    Where the exact planner knows no plan, no arm is to move. Every other decision is the policy's own.
+
+    Attributes:
+        inner: the policy.
+        planner: of the arms that are left.
+    """
+
+    def __init__(self, inner: SupervisorPolicy) -> None:
+        super().__init__(inner.rules, inner.name)
+        self.inner, self.about, self.planner = inner, inner.about, ExactPlanner(inner.rules)
+        self.variant, self.any_cell = inner.variant, inner.any_cell
+
+    def under(self, rules: Rules) -> SupervisorPolicy:
+        """The same policy under another rule book."""
+        return ResigningPolicy(self.inner.under(rules))
+
+    def require_executors(self) -> None:
+        """As the policy."""
+        self.inner.require_executors()
+
+    def alternatives(self, action: Floats, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        """The policy's."""
+        return self.inner.alternatives(action, pose, goal, previous_arm)
+
+    def act(self, pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
+        """The policy's decision, or that no arm is to move."""
+        solvable = self.planner.plan(pose, goal).transfers > 0
+        return np.where(solvable[..., None], self.inner.act(pose, goal, previous_arm), np.nan)
+
+    def unsolvable_because(self, pose: Floats, goal: Floats) -> str:
+        """Why the goal (3,) cannot be reached from ``pose`` (3,) any more; empty if it can."""
+        why = self.planner.unsolvable_because(pose, goal)
+        return why and f"the goal cannot be reached any more, with {listed(self.rules.cell.names)} alone: {why}"

@@ -25,7 +25,7 @@ from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.parsing import parse_object
 from marl_handover.plugins import Registry
 from marl_handover.policies.files import KINDS, read_policy, require_policy, stored_settings
-from marl_handover.policies.policy import SHIELDED, Floats, ShieldedPolicy, SupervisorPolicy
+from marl_handover.policies.policy import SHIELDED, Floats, ResigningPolicy, ShieldedPolicy, SupervisorPolicy
 from marl_handover.task.actions import action_of
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Rules
@@ -226,7 +226,8 @@ def adapted(
     trained = own.rules.config.architecture
     if own.about and not own.any_cell and settings.architecture != trained:
         raise CheckpointMismatch(name, "architecture", trained, settings.architecture)
-    return own.under(_rules(own.rules.cell if cell is None else load_cell(cell), settings, motion, own.about))
+    adapted_to = own.under(_rules(own.rules.cell if cell is None else load_cell(cell), settings, motion, own.about))
+    return ResigningPolicy(adapted_to) if adapted_to.rules.cell.config.enabled else adapted_to
 
 
 def content_hash(name: str) -> str:

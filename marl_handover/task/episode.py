@@ -1,7 +1,8 @@
 """An episode under the rule book, decision by decision: the one stepper of exact arms, numpy or torch, one problem or a batch.
 
-:func:`advance` takes a decision, counts transfers and tells when an episode is over; :func:`play` does so to the end for a whole batch.
-Environments, plans and what a policy means to do next use the first, evaluation the second.
+:func:`advance` takes a decision, counts transfers and tells when an episode is over; :func:`play` does so to the end for a whole batch,
+:func:`go_on` for episodes that are under way, up to a number of transfers if need be. Environments, plans and what a policy means to do
+next use the first, evaluation the others.
 
 Where transfers are carried out one by one and measured, an episode takes the same steps: :func:`final_transfer` before and after each
 command, :func:`measured_verdict` of what came of it, :func:`conclude`.
@@ -32,6 +33,19 @@ class Episodes(NamedTuple):
     outcome: Array
     transfers: Array
     pose: Array
+
+
+class Underway(NamedTuple):
+    """A batch of episodes that have begun.
+
+    ``outcome`` (n,) is NONE while one goes on; ``transfers`` (n,) made; ``pose`` (n, 3) and ``previous_arm`` (n,) now; ``goal`` (n, 3).
+    """
+
+    outcome: Array
+    transfers: Array
+    pose: Array
+    previous_arm: Array
+    goal: Array
 
 
 class Decision(NamedTuple):
@@ -131,37 +145,65 @@ def play(
     noise: Noise | None = None,
     observer: Observer | None = None,
 ) -> Episodes:
-    """Play every problem, pose and goal (n, 3), to its end. Only running episodes are computed.
+    """Play every problem, pose and goal (n, 3), to its end."""
+    return Episodes(*go_on(rules, act, begin(pose, goal), epsilon_rad, noise, observer)[:3])
+
+
+def begin(pose: Array, goal: Array) -> Underway:
+    """Episodes with the starts and goals (n, 3), before the first decision."""
+    zero = namespace(pose).zeros_like(pose[:, 0])
+    none = namespace(pose).where(zero == 0, int(Outcome.NONE), 0)
+    return Underway(none, none, pose, none - 1, goal)
+
+
+def go_on(
+    rules: Rules,
+    act: Act | Callable[[Rules], Act],
+    episodes: Underway,
+    epsilon_rad: float | None = None,
+    noise: Noise | None = None,
+    observer: Observer | None = None,
+    *,
+    rows: Array | None = None,
+    until: Array | None = None,
+) -> Underway:
+    """Play the episodes that go on to their ends, or until they have ``until`` (n,) transfers. Only running ones are computed.
 
     For a batch of cells ``act`` takes the rules of the rows that run, and returns the policy that acts under them.
+    ``rows``: bool (n,), which of them; all if None.
     """
-    xp, in_cells = namespace(pose), isinstance(rules.cell, CellBatch)
-    count = len(pose)
-    zero = xp.zeros_like(pose[:, 0])
-    outcome = xp.where(zero == 0, int(Outcome.TIMEOUT), 0)
-    transfers = xp.where(zero == 0, 0, 1)
-    previous = transfers - 1
-    running = xp.arange(count)
-    ended = pose
+    xp, in_cells = namespace(episodes.pose), isinstance(rules.cell, CellBatch)
+    outcome, transfers, ended, previous_arm, goals = episodes
+    waits = outcome == int(Outcome.NONE)
+    waits = waits if rows is None else waits & rows
+    running = xp.arange(len(goals))[waits if until is None else waits & (transfers < until)]
+    pose, goal, previous = ended[running], goals[running], previous_arm[running]
     while len(running):
-        here, there = pose, goal
         made = transfers[running]
         here_rules = rules.of_rows(running)
         policy: Any = act(here_rules) if in_cells else act  # type: ignore[call-arg]
-        action = policy(here, there, previous)
-        noises = [None if noise is None else noise(len(here)) for _ in range(2)]
+        action = policy(pose, goal, previous)
+        noises = [None if noise is None else noise(len(pose)) for _ in range(2)]
         stepped = advance(
-            here_rules, here, there, previous, action, made, epsilon_rad=epsilon_rad, noise=noises[0], final_noise=noises[1], may_wait=True
+            here_rules,
+            pose,
+            goal,
+            previous,
+            action,
+            made,
+            epsilon_rad=epsilon_rad,
+            noise=noises[0],
+            final_noise=noises[1],
+            may_wait=True,
         )
         result = stepped.result
         if observer is not None:
-            observer(Decision(running, here, there, previous, made, result))
-        verdict = xp.where(result.terminated, result.outcome, int(Outcome.TIMEOUT))
-        outcome, transfers = _put(outcome, running, verdict), _put(transfers, running, stepped.transfers)
-        ended = _put(ended, running, result.pose)
-        going = ~stepped.over
-        running, pose, goal, previous = running[going], result.pose[going], there[going], result.previous_arm[going]
-    return Episodes(outcome, transfers, ended)
+            observer(Decision(running, pose, goal, previous, made, result))
+        outcome, transfers = _put(outcome, running, stepped.outcome), _put(transfers, running, stepped.transfers)
+        ended, previous_arm = _put(ended, running, result.pose), _put(previous_arm, running, result.previous_arm)
+        going = ~stepped.over if until is None else ~stepped.over & (stepped.transfers < until[running])
+        running, pose, goal, previous = running[going], result.pose[going], goal[going], result.previous_arm[going]
+    return Underway(outcome, transfers, ended, previous_arm, goals)
 
 
 def nobody_moves(action: Array) -> Array:

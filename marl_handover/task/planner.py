@@ -136,6 +136,11 @@ class ExactPlanner:
                 return str(error)
         if int(self.plan(pose, goal, epsilon_rad).transfers):
             return ""
+        cell = self.rules.cell
+        ends = [np.flatnonzero(cell.reaches(np.asarray(where, float))) for where in (pose, goal)]
+        if not any(set(group) & set(ends[0]) and set(group) & set(ends[1]) for group in cell.graph.components):
+            start_arms, goal_arms = (", ".join(cell.names[arm] for arm in end) for end in ends)
+            return f"of the arms that reach the start ({start_arms}) none can pass to one that reaches the goal ({goal_arms})"
         epsilon_deg = math.degrees(self.rules.epsilon_rad if epsilon_rad is None else epsilon_rad)
         turn_deg = math.degrees(float(goal[2]) - float(pose[2]))
         most = self.rules.config.max_steps
