@@ -99,9 +99,7 @@ def policy_without(policy: SupervisorPolicy, arm: int) -> ResigningPolicy:
     if cell.num_arms == 1:
         raise InvalidSetting("outage.arm", cell.names[0], "left out in a cell with one arm that is in order")
     if not policy.any_cell:
-        raise InvalidSetting(
-            "policy", policy.name, "one that acts in any cell where an arm goes out of order: pretrained_any, exact, greedy or random"
-        )
+        raise InvalidSetting("policy", policy.name, "one that acts in any cell under an outage: pretrained_any, exact, greedy or random")
     if rules.config.reward.motion_weight:
         limit = "0 where an arm goes out of order: no lengths of paths are known without it"
         raise InvalidSetting("task.reward.motion_weight", rules.config.reward.motion_weight, limit)
@@ -138,8 +136,8 @@ class OutageRun:
         self.rest = {int(arm): policy_without(policy, int(arm)) for arm in np.unique(outages.arm)}
         self.struck = Struck(0, 0, 0)
         self._noise = placement_noise(policy.rules, seed)
-        self._acts = {arm: mistaken(each.rules, each.act, seed + arm + 1) for arm, each in self.rest.items()}
-        self._act = mistaken(policy.rules, policy.act, seed)
+        seeing = mistaken(policy.rules, seed)
+        self._act, self._acts = seeing(policy.act), {arm: seeing(each.act) for arm, each in self.rest.items()}
         self._trace = trace
         self._traces = {} if trace is None else {arm: _continued(trace, each.rules) for arm, each in self.rest.items()}
 

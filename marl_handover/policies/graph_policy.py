@@ -50,11 +50,21 @@ class GraphPolicy(SupervisorPolicy):
         seen = observe(rules, "graph", pose, goal, previous_arm).astype(np.float32)
         seen = seen.reshape(-1, seen.shape[-1])
         graph = HandoverGraphs(seen, rules.cell.num_arms)
+        if not len(graph.giver):
+            return self._alone(pose, goal, most)
         value, place, finish = branches(self.layers, self.shape, graph)
         if rules.external_finish:  # the final transfer is not the supervisor's
             finish = np.full_like(finish, -math.inf)
         choice = chosen(graph, value, place, finish, most)
         return self._action(graph, choice).reshape(*lead, *choice.final.shape[1:], -1)
+
+    def _alone(self, pose: Floats, goal: Floats, most: int | None) -> Floats:
+        """The answer where no two arms share a place, as others are out of order: an arm finishes, or none moves."""
+        able = self.rules.can_finish(pose, goal) & (not self.rules.external_finish)
+        arm = able.argmax(-1)
+        action = action_of(arm >= 0, arm, arm, np.zeros((*arm.shape, 2)), self.rules.cell.num_arms)
+        action = np.where(able.any(-1)[..., None], action, math.nan)
+        return action if most is None else action[..., None, :]
 
     def _action(self, graph: HandoverGraphs, choice: Choice) -> Floats:
         """Actions (n, ..., size) of choices (n, ...)."""

@@ -201,7 +201,8 @@ def _try_out(policy: SupervisorPolicy) -> None:
     size = policy.rules.action_size
     if action.shape != (len(pose), size):
         raise ValueError(f"its answers have the shape {action.shape[1:]}, not ({size},)")
-    if not np.isfinite(action).all() and policy.variant != "decentralised":  # there it means that nobody wants to move
+    may_wait = policy.variant == "decentralised" or cell.config.enabled is not None  # there it means that nobody wants to move
+    if not (np.isfinite(action).all() or may_wait):
         raise ValueError("its answers are no numbers")
 
 

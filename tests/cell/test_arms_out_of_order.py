@@ -114,8 +114,10 @@ def test_arms_that_share_nothing_do_what_each_can_alone(cell, names, architectur
     able = rules.can_finish(start, goal).any(-1)
     assert 0 < able.sum() < 200
     np.testing.assert_array_equal(ExactPlanner(rules).plan(start, goal).transfers, able)
-    for name in ("exact", "greedy", "random", "shielded:random"):
-        played = play(rules, policies.load(name, left, rules.config).act, start, goal)
+    for name in ("exact", "greedy", "random", "shielded:random", "pretrained_any", "shielded:pretrained_any"):
+        policy = policies.load(name, left, rules.config)
+        played = play(rules, policy.act, start, goal)
+        assert policy.alternatives(policy.act(start, goal, np.full(2000, -1)), start, goal, np.full(2000, -1)).ndim == 3
         solved = played.outcome == int(Outcome.SUCCESS)
         assert not (solved & ~able).any()
         assert name == "random" or (solved == able).all()

@@ -56,7 +56,7 @@ def check_episodes(run: OutageRun, trace: Trace, outcome: np.ndarray) -> None:
 
 @pytest.mark.parametrize("architecture", ["A", "B"])
 @pytest.mark.parametrize("name", ["paper", "triangle", "line4"])
-@pytest.mark.parametrize("policy", ["exact", "greedy"])
+@pytest.mark.parametrize("policy", ["exact", "greedy", "pretrained_any"])
 def test_the_others_go_on(name, policy, architecture):
     """The exact policy solves all that can be solved; the arm that is out moves nothing any more."""
     supervisor = policies.load(policy, load_cell(name), TaskConfig(architecture=architecture))
@@ -64,7 +64,10 @@ def test_the_others_go_on(name, policy, architecture):
     run = OutageRun(supervisor, posed(supervisor.rules, 300), OutageConfig(), trace=trace)
     check_episodes(run, trace, run.evaluate().episodes.outcome)
     assert run.struck.episodes > 40
-    assert policy == "greedy" or run.struck.solved == run.struck.solvable
+    if policy == "exact":
+        assert run.struck.solved == run.struck.solvable
+    if policy == "pretrained_any":
+        assert run.struck.solved >= 0.95 * run.struck.solvable
 
 
 @settings(max_examples=15)
@@ -202,7 +205,7 @@ def test_problems_bring_their_cells(tmp_path):
     [
         (["outage.arm=top"], "'top' is not known; choose one of: left, right, random"),
         (["outage.after=-1"], "outage.after = -1"),
-        (["policy=pretrained_b", "outage.arm=left"], "must be one that acts in any cell where an arm goes out of order"),
+        (["policy=pretrained_b", "outage.arm=left"], "must be one that acts in any cell under an outage"),
         (["outage.arm=left", "arms.enabled=[left]"], "left out in a cell with one arm that is in order"),
         (["outage.arm=left", "arms.enabled=[right]"], "'left' is not known; choose one of: right, random"),
         (["outage.seed=1", "task.reward.motion_weight=1"], "no lengths of paths are known without it"),
