@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from marl_handover.config import bounded, check_bounds, chosen, path_field
+from marl_handover.config import bounded, check_bounds, chosen, path_field, require_choice
 from marl_handover.errors import InvalidSetting, UnknownChoice, WorkFailed
+from marl_handover.files import expanded
 
 if TYPE_CHECKING:
     from marl_handover.experiments.runs import Task
@@ -20,11 +21,12 @@ if TYPE_CHECKING:
 class CompareConfig:
     """Keys of ``compare``."""
 
-    suite: str = path_field("paper")  # paper, paper_steps, variants, ablations, seeds, engines, or a YAML file
+    suite: str = path_field("paper")  # paper, paper_steps, variants, ablations, seeds, engines, many_arms, or a YAML file
     preset: str = "full"  # full or quick, a smoke size
     rows: list[str] = field(default_factory=list)  # some of its rows; []: all
     seeds: int = bounded(0, 0, 1000)  # of every row; 0: as the suite has it; an evaluation that the suite gives fewer keeps to those
     out: str = path_field()  # folder of runs and results, shared by all machines; runs/compare/<suite>, with -quick
+    trained: dict[str, str] = field(default_factory=dict)  # row: folder with run directories of `train`, one a seed, taken as its runs
     overwrite: list[str] = field(default_factory=list)  # rows, or row/evaluation, whose results are thrown away and made anew
     report_only: bool = False  # run nothing: tables and figures of what is there
     launcher: str = chosen("loky", ("loky", "ray"))  # loky: the cores of this machine; ray: a cluster
@@ -46,7 +48,7 @@ def run(config: CompareConfig) -> int:
         WorkFailed: some tasks failed; the others are done and reported.
     """
     from marl_handover.commands import evaluate, train
-    from marl_handover.experiments.runs import Grammar, check_unchanged, plan_tasks
+    from marl_handover.experiments.runs import Grammar, check_unchanged, plan_tasks, take_trained
     from marl_handover.experiments.statistics import require_statistics
     from marl_handover.experiments.suite import load_suite
 
@@ -63,6 +65,8 @@ def run(config: CompareConfig) -> int:
     tasks = plan_tasks(suite, out, Grammar(train.ALIASES, train.GROUPS), Grammar(evaluate.ALIASES, evaluate.GROUPS))
     for task in tasks:
         check_unchanged(task, config.overwrite)
+    for row, folder in config.trained.items():
+        take_trained(tasks, row, expanded(folder))
     failures, others = ({}, []) if config.report_only else _run_tasks(config, tasks)
     results = _report(suite, whole, tasks, failures, out)
     _require_done(results, len(tasks), others, config.report_only)
@@ -75,6 +79,8 @@ def _check(config: CompareConfig, suite: Suite) -> None:
     for row in suite.rows:
         specs = [spec for seed in suite.seeds_of(row) for spec in suite.evaluations_of(row, seed)]
         known += dict.fromkeys(f"{row.name}/{spec.name}" for spec in specs)
+    for name in config.trained:
+        require_choice("trained", name, [row.name for row in suite.rows if row.train is not None])
     for name in config.overwrite:
         if name not in known:
             raise UnknownChoice("overwrite", name, known)

@@ -135,6 +135,7 @@ def _row(suite: Suite, row: RowSpec, tasks: Sequence[Task], runs: list[Tree]) ->
     }
     names = [spec.name for spec in suite.evaluations]
     content["evaluations"] = {name: _evaluation(content, name) for name in names if any(name in run["evaluations"] for run in runs)}
+    content["by_arms"] = {name: found for name in content["evaluations"] if (found := _by_arms(content, name))}
     metrics: list[Metrics] = [_arrays(run["metrics"]) for run in runs if "metrics" in run]
     content["curves"] = _curves(metrics, _measures(suite)) if metrics else {}
     content["milestones"] = _milestones(metrics) if metrics else {}
@@ -154,6 +155,24 @@ def _evaluation(row: Tree, name: str) -> Tree:
         table = np.stack([columns[measure] for measure in measures], -1)
         for measure, interval in zip(measures, statistics.summarised(table[:, None, :]), strict=True):
             found[measure] = {**interval._asdict(), "mean": float(columns[measure].mean()), "runs": runs}
+    return found
+
+
+def _by_arms(row: Tree, name: str) -> Tree:
+    """One evaluation in random cells, by the number of arms: shares and means over the runs, and the median time of a decision."""
+    reports = [run["evaluations"][name].get("by_arms", {}) for run in row["runs"] if name in run["evaluations"]]
+    found: Tree = {}
+    for arms in sorted({arms for report in reports for arms in report}, key=int):
+        parts = [report[arms] for report in reports if arms in report]
+        episodes, ratios = [part["episodes"] for part in parts], [part["steps_ratio"] for part in parts if part["steps_ratio"] is not None]
+        found[arms] = {
+            "runs": len(parts),
+            "episodes": sum(episodes),
+            "unsolvable": sum(part["unsolvable"] for part in parts),
+            "success_rate": statistics.share_interval([part["success_rate"] for part in parts], episodes)._asdict(),
+            "steps_ratio": statistics.mean_interval(ratios)._asdict() if ratios else None,
+            "decision_ms": float(np.median([part["decision_us"]["p50"] for part in parts])) / 1e3,
+        }
     return found
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 from marl_handover.compose import Groups, compose
 from marl_handover.control.evaluation import AssessmentConfig
 from marl_handover.control.settings import twin_workcell
-from marl_handover.errors import HandoverError, InvalidSetting, UnknownChoice, WorkFailed
+from marl_handover.errors import HandoverError, InvalidSetting, MissingFile, UnknownChoice, WorkFailed
 from marl_handover.experiments import provenance
 from marl_handover.experiments.provenance import fingerprint, read_record, settings_of, write_record
 from marl_handover.experiments.suite import EVALUATION_SEED_OFFSET, RECORDS, RUN, RowSpec, Suite
@@ -22,11 +22,15 @@ from marl_handover.files import expanded
 from marl_handover.learning.recorder import machine
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.locks import held
+from marl_handover.parsing import read_json
 from marl_handover.policies.policy import SHIELDED
 from marl_handover.policies.registry import names
 
 ASKED, TRAINED, DONE = (f"{name}.json" for name in RECORDS)
 RUN_FOLDER = "run"
+
+UNKNOWN = "unknown"
+"""Commit of a run that was trained elsewhere."""
 
 GRACE_S = 20.0
 """So long a task waits for its lock: a worker whose machine has left the cluster may live on for some seconds."""
@@ -221,8 +225,61 @@ def _train(task: Task, config: TrainConfig, here: Mapping[str, Any]) -> None:
     if (folder / FILE).is_file():
         trainer.restore()
     summary = trainer.run()
-    kept = {key: summary[key] for key in ("step", "gradient_step", "episodes", "wall_s", "best_step", "selection", "compile_state")}
-    write_record(task.folder / TRAINED, {**asked, **kept})
+    write_record(task.folder / TRAINED, {**asked, **{key: summary[key] for key in KEPT}})
+
+
+KEPT = ("step", "gradient_step", "episodes", "wall_s", "best_step", "selection", "compile_state")
+"""What a task keeps of a run's summary."""
+
+
+def take_trained(tasks: Sequence[Task], row: str, folder: Path) -> None:
+    """Give the tasks of a row the finished runs that ``train`` left in a folder: each the one with its settings, its seed included.
+
+    A task that is trained already is left as it is, and so is the folder.
+
+    Raises:
+        MissingFile: the folder has no finished run with the seed and settings of a task; the message says what is nearest.
+    """
+    runs = _finished_runs(folder)
+    for task in (task for task in tasks if task.row == row and task.train is not None):
+        with held(task.folder, GRACE_S) as mine:
+            if mine and read_record(task.folder / TRAINED, provenance.TRAINED_KEYS) is None:
+                _take(task, _fitting(task, runs, folder))
+
+
+def _finished_runs(folder: Path) -> dict[Path, TrainConfig]:
+    from marl_handover.learning.checkpoint import train_config
+
+    if not folder.is_dir():
+        raise MissingFile("folder of run directories", folder)
+    found = [path.parent / "config.yaml" for path in sorted(folder.glob("*/summary.json"))]
+    return {path.parent: train_config(path.read_text(encoding="utf-8"), path) for path in found}
+
+
+def _fitting(task: Task, runs: Mapping[Path, TrainConfig], folder: Path) -> Path:
+    """The run with the task's settings."""
+    assert task.train is not None
+    wrong = []
+    for path, config in runs.items():
+        key, stored, asked = next(iter(provenance.differences(settings_of(config), task.train)), ("", None, None))
+        if not key:
+            return path
+        if config.seed == task.seed:
+            wrong.append(f"{path.name} has {key} = {stored!r}, not {asked!r}")
+    raise MissingFile(f"finished run for {task.name}", folder, "; ".join(wrong) or f"train seed={task.seed} there first")
+
+
+def _take(task: Task, run: Path) -> None:
+    assert task.train is not None
+    settings = settings_of(task.train)
+    summary = read_json(run / "summary.json", "summary")
+    task.folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(task.folder / RUN_FOLDER, ignore_errors=True)
+    shutil.copytree(run, task.folder / RUN_FOLDER)
+    asked = {"row": task.row, "seed": task.seed, "arguments": list(task.arguments), "config_hash": fingerprint(settings)}
+    asked |= {"commit": UNKNOWN, "machine": summary["machine"], "commits": [UNKNOWN]}
+    write_record(task.folder / ASKED, {**asked, "settings": settings})
+    write_record(task.folder / TRAINED, {**asked, **{key: summary[key] for key in KEPT}})
 
 
 def _judge(task: Task, job: EvaluationJob, here: Mapping[str, Any]) -> None:

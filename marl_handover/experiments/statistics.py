@@ -14,9 +14,11 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.stats import t as student
 
 from marl_handover.arrays import Floats
 from marl_handover.errors import MissingExtra
+from marl_handover.learning.evaluation import wilson_interval
 
 REPETITIONS = 2000
 COVERAGE = 0.95
@@ -104,6 +106,28 @@ def band_of(scores: Floats, estimator: Callable[[Floats], Floats] = interquartil
 def profile(scores: Floats, thresholds: Floats) -> Band:
     """Performance profile of scores (runs, tasks): at each threshold the share of them that lies above it."""
     return band_of(scores, lambda drawn: (drawn[..., None] > thresholds).mean((0, 1)))
+
+
+def share_interval(shares: Sequence[float], episodes: Sequence[int]) -> Interval:
+    """The mean of each run's share of ``episodes`` that were solved, and its 95 % interval, also of one run.
+
+    It is the wider of two, end by end: what the runs tell (Student's t), which knows nothing where all runs agree, and what their episodes
+    tell (Wilson's of all of them), which knows nothing of how runs differ.
+    """
+    found = mean_interval(shares)
+    of_all = sum(share * count for share, count in zip(shares, episodes, strict=True))
+    low, high = wilson_interval(round(of_all), sum(episodes))
+    ends = (low, high) if found.low is None or found.high is None else (max(0.0, min(low, found.low)), min(1.0, max(high, found.high)))
+    return Interval(found.value, min(ends[0], found.value), max(ends[1], found.value))
+
+
+def mean_interval(values: Sequence[float]) -> Interval:
+    """The mean of each run's value, with Student's 95 % interval."""
+    value, count = float(np.mean(values)), len(values)
+    if count == 1:
+        return Interval(value, None, None)
+    half = float(student.ppf((1 + COVERAGE) / 2, count - 1) * np.std(values, ddof=1) / math.sqrt(count))
+    return Interval(value, value - half, value + half)
 
 
 def true_coverage(runs: int) -> float | None:

@@ -58,6 +58,7 @@ FIGURES = {
     "curves": ("rows", "measure", "x"),
     "bars": ("rows", "evaluations", "measure"),
     "end_states": ("rows", "evaluations"),
+    "arms": ("rows", "evaluations"),
     "profiles": ("rows", "evaluations"),
     "workspace": (),
 }
@@ -70,6 +71,7 @@ TABLES = {
     "comparison": ("evaluations", "pairs"),
     "range": ("rows", "evaluations"),
     "paired": ("rows", "evaluations"),
+    "arms": ("rows", "evaluations"),
 }
 """The same of tables."""
 
@@ -121,7 +123,7 @@ class FigureSpec:
     """One picture, as PNG and PDF."""
 
     name: str = ""
-    kind: str = ""  # curves, bars, end_states, profiles, workspace
+    kind: str = ""  # curves, bars, end_states, profiles, workspace, arms: by the number of arms of random cells
     title: str = ""
     rows: list[str] = field(default_factory=list)  # empty: all that have such values
     evaluations: list[str] = field(default_factory=list)  # empty: all, unless only some of them are shielded
@@ -134,7 +136,7 @@ class TableSpec:
     """One table, as Markdown and CSV."""
 
     name: str = ""
-    kind: str = ""  # evaluation, milestones, runs, comparison, range, paired: two evaluations of the same problems
+    kind: str = ""  # evaluation, milestones, runs, comparison, range, arms, paired: two evaluations of the same problems
     title: str = ""
     rows: list[str] = field(default_factory=list)
     evaluations: list[str] = field(default_factory=list)  # as of figures
@@ -314,10 +316,12 @@ def check(suite: Suite) -> None:
         _check_shown(suite, f"figures: {figure.name}", figure, FIGURES)
         require_choice(f"figures: {figure.name}: measure", figure.measure, CURVE_MEASURES if figure.kind == "curves" else BAR_MEASURES)
         require_choice(f"figures: {figure.name}: x", figure.x, CURVE_AXES)
+        _check_by_arms(suite, f"figures: {figure.name}", figure)
     for table in suite.tables:
         _check_shown(suite, f"tables: {table.name}", table, TABLES)
         if table.kind == "comparison":
             _check_pairs(suite, table)
+        _check_by_arms(suite, f"tables: {table.name}", table)
         if table.kind == "paired" and len(table.evaluations) != 2:
             raise BadEntry(f"tables: {table.name}: evaluations", "two of them are held against each other: [one, other]")
     _check_shield(suite)
@@ -375,6 +379,17 @@ def _check_shown(suite: Suite, where: str, spec: FigureSpec | TableSpec, kinds: 
     for key, known in (("rows", suite.rows), ("evaluations", suite.evaluations)):
         for name in getattr(spec, key):
             require_choice(f"{where}: {key}", name, tuple(entry.name for entry in known))
+
+
+def _check_by_arms(suite: Suite, where: str, spec: FigureSpec | TableSpec) -> None:
+    """What goes by the number of arms names evaluations in random cells."""
+    if spec.kind != "arms":
+        return
+    random = [each.name for each in suite.evaluations if any(argument.startswith("layouts.") for argument in each.arguments)]
+    if not spec.evaluations:
+        raise BadEntry(f"{where}: evaluations", f"the kind arms names some in random cells: {', '.join(random) or 'there is none'}")
+    for name in spec.evaluations:
+        require_choice(f"{where}: evaluations", name, tuple(random))
 
 
 def _check_shield(suite: Suite) -> None:

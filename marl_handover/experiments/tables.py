@@ -68,6 +68,7 @@ def make_tables(results: Tree) -> list[Table]:
         "comparison": _comparison,
         "range": _range,
         "paired": _paired,
+        "arms": _arms,
     }
     tables = [Table(spec["name"], spec["title"] or spec["name"], *makers[spec["kind"]](results, spec)) for spec in results["tables"]]
     return [table for table in tables if table.rows]
@@ -262,6 +263,27 @@ def _paired(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
         values = [_interval(found["first"], form, scale), _interval(found["second"], form, scale)]
         rows.append([_text(names[found["row"]]), _text(title), *values, _interval(found["difference"], signed, scale)])
     return columns, rows
+
+
+def _arms(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
+    """Success, steps and the time of one decision by the number of arms, in the random cells of the evaluations together."""
+    columns = [
+        Column("arms"),
+        Column("row"),
+        Column("seeds"),
+        Column("problems", ("episodes",)),
+        Column("unsolvable, left out", ("unsolvable",)),
+    ]
+    columns += [_interval_column("success, %", "success_rate"), _interval_column("steps ÷ optimum (solved)", "steps_ratio")]
+    columns.append(Column("one decision, ms", ("decision_ms",)))
+    rows = []
+    for row in _wanted(results, spec["rows"]):
+        for name in spec["evaluations"]:
+            for arms, found in row["by_arms"].get(name, {}).items():
+                counts = [_plain(found[key]) for key in ("runs", "episodes", "unsolvable")]
+                cells = [_interval(found["success_rate"], "{:.2f}", 100), _interval(found["steps_ratio"], "{:.3f}")]
+                rows.append([_text(int(arms)), _text(row["label"]), *counts, *cells, _plain(found["decision_ms"], "{:.2f}")])
+    return columns, sorted(rows, key=lambda cells: cells[0].values[0])
 
 
 def expected_lines(results: Tree, name: str, found: Tree) -> list[str]:

@@ -188,6 +188,7 @@ def make_figures(results: Tree) -> Iterator[tuple[str, Figure | None]]:
         "bars": bars_figure,
         "end_states": endings_figure,
         "profiles": profiles_figure,
+        "arms": arms_figure,
         "workspace": lambda results, spec: workspace_figure(build_cell(CellConfig())),
     }
     for spec in results["figures"]:
@@ -270,6 +271,49 @@ def profiles_figure(results: Tree, spec: Tree) -> Figure | None:
     axes.set_ylabel("runs above τ")
     _frame(figure, axes, spec)
     return figure
+
+
+BY_ARMS = {
+    "success_rate": ("success", 100.0),
+    "steps_ratio": ("transfers ÷ optimum, solved", 1.0),
+    "decision_ms": ("one decision, ms", 1.0),
+}
+"""Panels by the number of arms: key, title, scale."""
+
+
+def arms_figure(results: Tree, spec: Tree) -> Figure | None:
+    """Success, steps against the optimum and the time of a decision by the number of arms; bars are intervals over the runs."""
+    shown = [(row, _of_arms(row, spec)) for row in _rows(results, spec)]
+    shown = [(row, found) for row, found in shown if found]
+    if not shown:
+        return None
+    figure = Figure(figsize=(9.6, 3.9), layout="constrained")
+    for axes, (key, (title, scale)) in zip(figure.subplots(1, len(BY_ARMS)), BY_ARMS.items(), strict=True):
+        for index, (row, found) in enumerate(shown):
+            known = {arms: part[key] for arms, part in found.items() if part[key] is not None}
+            parts = [part if isinstance(part, Mapping) else {"value": part, "low": None, "high": None} for part in known.values()]
+            values = scale * np.array([part["value"] for part in parts])
+            ends = [[0.0 if part[end] is None else scale * abs(part[end] - part["value"]) for part in parts] for end in ("low", "high")]
+            style: Mapping[str, Any] = {**series_style(index), "marker": series_marker(index), "markersize": 4.5, "linewidth": 1.4}
+            axes.errorbar(list(known), values, yerr=ends, capsize=2, label=row["label"], **style)
+        axes.set_title(title, fontsize=9)
+        axes.set_xlabel("arms", fontsize=9)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.tick_params(labelsize=8)
+        ruled(axes)
+        if scale == 100:
+            axes.yaxis.set_major_formatter(PercentFormatter(100))
+        elif key == "decision_ms":
+            axes.set_yscale("log")
+    _titled(figure, spec)
+    legend_below(figure, figure.axes[0])
+    return figure
+
+
+def _of_arms(row: Tree, spec: Tree) -> dict[int, Tree]:
+    """What a row has of each number of arms, in the evaluations together."""
+    parts = {int(arms): found for name in spec["evaluations"] for arms, found in row["by_arms"].get(name, {}).items()}
+    return dict(sorted(parts.items()))
 
 
 def _frame(figure: Figure, axes: Axes, spec: Tree) -> None:
