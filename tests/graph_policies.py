@@ -27,8 +27,8 @@ def stored(shape, weights):
     return arrays, {"kind": "graph", "variant": "hierarchical", "layout": "graph", "layers": len(weights), "shape": shape._asdict()}
 
 
-def random_policy(rules, start, goal, seed=0, shape=None):
-    """A policy of random weights under a rule book, which wants to finish about two in five of the problems (n, 3), (n, 3)."""
+def balanced_weights(rules, start, goal, seed=0, shape=None):
+    """Random layers that want to finish about two in five of the problems (n, 3), (n, 3)."""
     shape, weights = shape or GraphShape(), random_weights(shape, seed)
     policy = GraphPolicy(rules, "random weights", *stored(shape, weights))
     seen = observe(rules, "graph", start, goal, np.full(len(start), -1)).astype(np.float32)
@@ -37,4 +37,20 @@ def random_policy(rules, start, goal, seed=0, shape=None):
     ahead = chosen(graph, value, place, 0 * finish - math.inf).value - chosen(graph, 0 * value - math.inf, place, finish).value
     weight, bias = weights["finish_out"]
     weights["finish_out"] = weight, bias + np.quantile(ahead, 0.4).astype(np.float32)
-    return GraphPolicy(rules, "random weights", *stored(shape, weights))
+    return weights
+
+
+def random_policy(rules, start, goal, seed=0, shape=None):
+    """A policy of such weights under a rule book."""
+    shape = shape or GraphShape()
+    return GraphPolicy(rules, "random weights", *stored(shape, balanced_weights(rules, start, goal, seed, shape)))
+
+
+def lead(policy, start, goal, previous):
+    """By how much (n,) the best branch is better than the best one that does something else; places that nearly coincide are one."""
+    rules = policy.rules
+    seen = observe(rules, "graph", start, goal, previous).astype(np.float32)
+    graph = HandoverGraphs(seen, rules.cell.num_arms)
+    every = chosen(graph, *branches(policy.layers, policy.shape, graph), 1 << 20)
+    same = (every.edge == every.edge[:, :1]) & (every.arm == every.arm[:, :1]) & (abs(every.place - every.place[:, :1]) < 1e-3)
+    return every.value[:, 0] - np.where(same, -math.inf, every.value).max(-1)

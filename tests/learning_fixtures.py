@@ -29,6 +29,10 @@ SMALL_NETWORKS = {
     "flat_sac": ("hidden=[32,32]", "learning_starts=200", "batch_size=32", "env_steps_per_gradient_step=16"),
     "td3": ("hidden=[32,32]", "learning_starts=200", "batch_size=32", "env_steps_per_gradient_step=16"),
     "dqn": ("hidden=[32,32]", "learning_starts=200", "batch_size=32", "env_steps_per_gradient_step=16"),
+    "graph_sac": (
+        *("width=16", "rounds=2", "layouts_at_once=12", "layouts_interval=320"),
+        *("learning_starts=200", "batch_size=32", "env_steps_per_gradient_step=16"),
+    ),
     "ppo": ("hidden=[32,32]", "rollout_steps=16", "batch_size=160", "epochs=2"),
 }
 

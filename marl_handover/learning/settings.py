@@ -319,6 +319,7 @@ class TrainConfig:
         noise = self.task.noise
         limits: tuple[tuple[str, Any, Any, str], ...] = (
             ("task.architecture", self.task.architecture, "B", "whose policy acts under A, too"),
+            ("task.symmetry_order", self.task.symmetry_order, 1, "whose policy takes blocks of any symmetry"),
             ("source", self.source, "batched", "the rule book itself"),
             ("replay.symmetry", self.replay.symmetry, False, "whose cells have no mirror image of their own"),
             ("replay.correct_terminated", self.replay.correct_terminated, True, "which derives it"),

@@ -22,7 +22,7 @@ from marl_handover.task.episode import play
 from marl_handover.task.observations import observe
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules
-from tests.graph_policies import random_policy
+from tests.graph_policies import lead, random_policy
 from tests.layouts import line, model_of, moved, ring
 from tests.oracles.layouts import Layout
 
@@ -45,16 +45,6 @@ def drawn(seed):
 def rules_of(arms, discs, **task):
     """The rule book of a layout, one row for each problem."""
     return Rules(CellBatch(LayoutPool([(arms, discs)]), np.zeros(COUNT, np.int64)), TaskConfig(**task))
-
-
-def lead(policy, start, goal, previous):
-    """By how much (n,) the best branch is better than the best one that does something else; places that nearly coincide are one."""
-    rules = policy.rules
-    seen = observe(rules, "graph", start, goal, previous).astype(np.float32)
-    graph = HandoverGraphs(seen, rules.cell.num_arms)
-    every = chosen(graph, *branches(policy.layers, policy.shape, graph), 1 << 20)
-    same = (every.edge == every.edge[:, :1]) & (every.arm == every.arm[:, :1]) & (abs(every.place - every.place[:, :1]) < 1e-3)
-    return every.value[:, 0] - np.where(same, -math.inf, every.value).max(-1)
 
 
 def decided(policy, *problem):
