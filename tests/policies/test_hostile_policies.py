@@ -24,9 +24,9 @@ GOOD = package_path("pretrained/b.npz")
 STORED_RUN = Path(__file__).parents[1] / "data" / "run_0_1"
 
 
-def stored(path, arrays=None, **about):
+def stored(path, arrays=None, good=GOOD, **about):
     """The shipped policy with other arrays, and saying other things of itself."""
-    own = read_arrays(GOOD, LIMIT_BYTES, "policy")
+    own = read_arrays(good, LIMIT_BYTES, "policy")
     said = {**json.loads(str(own["about"])), **about}
     np.savez(path, **{**own, **(arrays or {}), "about": np.array(json.dumps(said))})
     return str(path)
@@ -96,6 +96,87 @@ def test_weights_that_are_no_weights_are_refused(tmp_path, name):
 @pytest.mark.parametrize("name", BAD_WORDS)
 def test_a_policy_that_says_the_wrong_thing_of_itself_is_refused(tmp_path, name):
     assert_one_line(stored(tmp_path / "bad.npz", **BAD_WORDS[name]))
+
+
+GRAPH = package_path("pretrained/any.npz")
+
+
+def graph_arrays():
+    return {name: array for name, array in read_arrays(GRAPH, LIMIT_BYTES, "policy").items() if name != "about"}
+
+
+def of_shape(**lie):
+    """The shape that the shipped policy for any cell says, changed."""
+    return {"shape": {**json.loads(str(read_arrays(GRAPH, LIMIT_BYTES, "policy")["about"]))["shape"], **lie}}
+
+
+BAD_SHAPES = {
+    "wider": of_shape(width=128),
+    "narrower": of_shape(width=16),
+    "not of sixteens": of_shape(width=60),
+    "endless width": of_shape(width=10**12),
+    "width is text": of_shape(width="64"),
+    "width is true": of_shape(width=True),
+    "fewer components": of_shape(components=1),
+    "endless components": of_shape(components=10**12),
+    "endless rounds": of_shape(rounds=10**12),
+    "less than no rounds": of_shape(rounds=-1),
+    "rounds are no number": of_shape(rounds=float("nan")),
+    "slack is a number": of_shape(slack=1),
+    "more than a shape has": of_shape(depth=3),
+    "no shape": {"shape": None},
+    "a list": {"shape": [64, 6, 2, True]},
+    "layers are missing": {"layers": 3},
+    "one too many": {"layers": 100},
+    "kind": {"kind": "hybrid"},
+    "discrete": {"kind": "discrete"},
+    "layout": {"layout": "pixels"},
+    "variant": {"variant": "decentralised"},
+}
+BAD_LAYERS = {
+    "nan": lambda array: array * np.nan,
+    "infinite": lambda array: array + np.inf,
+    "complex": lambda array: array + 1j,
+    "whole numbers": lambda array: array.astype(np.int64),
+    "text": lambda array: array.astype("U20"),
+    "one number": lambda array: array.reshape(-1)[0],
+    "turned over": lambda array: array.T if array.ndim == 2 and len(array) != array.shape[1] else array[:-1],
+    "one row less": lambda array: array[1:],
+    "one column more": lambda array: np.concatenate([array, array[..., -1:]], -1),
+    "a cube": lambda array: array[None],
+    "empty": lambda array: array[:0],
+}
+
+
+@pytest.mark.parametrize("name", BAD_SHAPES)
+def test_a_policy_for_any_cell_whose_shape_is_a_lie_is_refused(tmp_path, name):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert str(tmp_path) in assert_one_line(stored(tmp_path / "bad.npz", good=GRAPH, **BAD_SHAPES[name]))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
+
+
+@pytest.mark.parametrize("name", BAD_LAYERS)
+def test_a_policy_for_any_cell_whose_layers_do_not_fit_is_refused(tmp_path, name):
+    arrays = graph_arrays()
+    for layer in ("weight_0", "bias_0", "weight_5", "bias_9", f"weight_{len(arrays) // 2 - 1}"):
+        assert str(tmp_path) in assert_one_line(stored(tmp_path / "bad.npz", {layer: BAD_LAYERS[name](arrays[layer])}, GRAPH))
+
+
+@pytest.mark.parametrize("missing", ["weight_0", "bias_4", "about"])
+def test_a_policy_for_any_cell_that_lacks_something_is_refused(tmp_path, missing):
+    arrays = read_arrays(GRAPH, LIMIT_BYTES, "policy")
+    np.savez(tmp_path / "bad.npz", **{name: array for name, array in arrays.items() if name != missing})
+    assert_one_line(tmp_path / "bad.npz", "policy")
+
+
+def test_weights_of_a_pair_are_none_for_any_cell_nor_the_other_way_round(tmp_path):
+    assert_one_line(stored(tmp_path / "a.npz", kind="graph", layout="graph"))
+    assert_one_line(stored(tmp_path / "b.npz", good=GRAPH, kind="hybrid", layout="relative"))
+
+
+def test_a_policy_for_any_cell_that_overflows_is_refused(tmp_path):
+    arrays = {name: np.full_like(array, 1e30) for name, array in graph_arrays().items()}
+    assert "fit together" in assert_one_line(stored(tmp_path / "bad.npz", arrays, GRAPH))
 
 
 @pytest.mark.parametrize("value", [None, [], "text", 3, [[]]])
