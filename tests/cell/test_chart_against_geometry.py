@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from marl_handover.cell import layout_cell
-from tests.oracles.layouts import random_layout, wrapped
+from tests.oracles.layouts import NARROW_MM, SURE, layout_with_a_sliver, random_layout, wrapped
 
 REACH_MM, ROUND_TRIP_MM, OUTSIDE_MM = 1e-3, 1e-6, 0.05
 TIP_MM, ROUND_TRIP_AT_TIP_MM = 1e-4, 1e-5
@@ -120,6 +120,8 @@ def faults_on_the_table(layout, space, pair, draw):
     inside, outside = margin >= ROUND_TRIP_MM, margin < -OUTSIDE_MM
     missed = inside & ~within
     if missed.any():
+        missed[missed] = counted(layout, pair, place[missed])
+    if missed.any():
         worst = int(np.argmax(np.where(missed, margin, -np.inf)))
         said.append(f"{missed.sum()} places missed; {place[worst].tolist()}, {margin[worst]} mm inside, is at {alpha[worst], beta[worst]}")
     if (outside & within).any():
@@ -133,12 +135,21 @@ def faults_on_the_table(layout, space, pair, draw):
     return said
 
 
+def counted(layout, pair, place):
+    """Which places (n, 2) are surely of a space that is not narrower than 1 um everywhere."""
+    sampled = layout.sampled_angles(*pair, STEP_RAD / 2)
+    after = np.searchsorted(sampled, layout.hand_over_angle(place, *pair))
+    counts = layout.counts(*pair, sampled, STEP_RAD / 2)
+    return counts[after % len(sampled)] | counts[after - 1]
+
+
 def faults_of_arcs(layout, space, pair):
     """The arcs hold the angles of all places on the edge of the space, and no angle far from these."""
     said = []
     arcs = [(arc.low_rad, arc.width_rad) for arc in space.chart.arcs]
     sampled = layout.sampled_angles(*pair, STEP_RAD / 2)
     beyond = np.min([np.abs(wrapped(sampled - low - width / 2)) - width / 2 for low, width in arcs], 0)
+    beyond *= layout.counts(*pair, sampled, STEP_RAD / 2)
     if beyond.max() > 1e-7:
         said.append(f"angle {sampled[beyond.argmax()]} of a place lies {beyond.max()} rad outside the arcs {arcs}")
     for low, width in arcs:
@@ -173,6 +184,27 @@ def in_float32(layout, space, pair, draw, done):
 @pytest.mark.parametrize(("faults", "pairs"), [(in_float64, 100), (in_float32, 50)])
 def test_the_chart_is_a_bijection_onto_what_two_arms_share(faults, pairs):
     judge(0, pairs, faults)
+
+
+@pytest.mark.parametrize("less_mm", [0.0, 1e-4, 2e-3, 0.01, 1.0])
+def test_the_chart_holds_where_a_place_hardly_is_one(less_mm):
+    layout = layout_with_a_sliver(less_mm)
+    said = faults_of(layout, spaces_of(layout)[0, 2], (0, 2), np.random.default_rng(0), thorough=True)
+    assert not said
+
+
+def test_a_space_narrower_than_a_micrometre_everywhere_is_none():
+    """A triangle beside all else that two arms share grows: it is a space from where a curve of equal angle in it is that long."""
+    none_mm, some_mm = 0.0, 1.0
+    for _ in range(30):
+        middle_mm = (none_mm + some_mm) / 2
+        arcs = spaces_of(layout_with_a_sliver(middle_mm))[0, 2].chart.arcs
+        assert len(arcs) in (1, 2)
+        none_mm, some_mm = (middle_mm, some_mm) if len(arcs) == 1 else (none_mm, middle_mm)
+    layout = layout_with_a_sliver(some_mm)
+    angles = layout.sampled_angles(0, 2, STEP_RAD / 2)
+    longest_mm = max(layout.curve_mm(0, 2, angle) for angle in angles[angles < 3])
+    assert longest_mm == pytest.approx(NARROW_MM, rel=SURE - 1)
 
 
 @pytest.mark.slow

@@ -1,7 +1,8 @@
 """The fewest transfers of a problem by brute force: sampled hand-over places, sums of their angles, every sequence of arms.
 
 The set of angles that k hand-overs can add up to is a set of bins on the circle, one for each first and last arm; one more hand-over is a
-circular convolution. Of every set there are two: ``inner`` never claims a plan that is not there, ``outer`` never misses one.
+circular convolution. Of every set there are two: ``inner`` never claims a plan that is not there, ``outer`` never misses one. What is
+narrower than 1 um everywhere is no shared space: ``inner`` has none of its angles, ``outer`` has them.
 """
 
 from __future__ import annotations
@@ -24,19 +25,21 @@ class AngleSums:
         self.layout, self.bins = layout, bins
         self.width_rad = 2 * math.pi / bins
         count = layout.count
-        self.inner = np.zeros((count, count, bins), bool)
+        self.inner, self.sampled = np.zeros((2, count, count, bins), bool)
         for i in range(count):
             for j in range(i):
                 angles = layout.sampled_angles(i, j, self.width_rad / 2)
                 index = np.rint(angles / self.width_rad).astype(int) % bins
+                self.sampled[i, j, index] = self.sampled[j, i, -index % bins] = True
+                index = index[layout.counts(i, j, angles, self.width_rad / 2)]
                 self.inner[i, j, index] = self.inner[j, i, -index % bins] = True
 
     @cached_property
     def outer(self):
         """Every bin within two of a sampled one."""
-        wide = self.inner.copy()
+        wide = self.sampled.copy()
         for shift in (-2, -1, 1, 2):
-            wide |= np.roll(self.inner, shift, -1)
+            wide |= np.roll(self.sampled, shift, -1)
         return wide
 
     def fewest(self, start, goal, epsilon_rad, limit=20, *, outer=False):

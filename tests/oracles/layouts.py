@@ -15,6 +15,15 @@ import numpy as np
 HALF_DIAGONAL_MM = 20 * math.sqrt(2)
 """Of the shipped block, 40 mm wide: its centre keeps so far away from a disc."""
 
+NARROW_MM = 1e-3
+"""A space in which no curve of equal angle is longer is none: arms tell places apart to 1 um."""
+
+SURE = 1.1
+"""A space counts surely if one of its curves is so many times as long."""
+
+FLAT_RAD = 1e-7
+"""A curve of equal angle nearer to 0 or pi is looked at so far from it, where it is a circle still."""
+
 
 def wrapped(angle):
     """An angle in (-pi, pi]."""
@@ -103,22 +112,9 @@ class Layout:
 
     def corners(self, i, j):
         """Places where two such curves meet, (n, 2), wherever they are."""
-        found = []
         circles, rays = self.circles(i, j), self.rays(i, j)
-        for (x, y, r), (u, v, s) in combinations(circles, 2):
-            distance = math.hypot(u - x, v - y)
-            if distance > 0 and abs(r - s) <= distance <= r + s:
-                along = (r * r - s * s + distance * distance) / (2 * distance)
-                across = math.sqrt(max(r * r - along * along, 0.0))
-                ex, ey = (u - x) / distance, (v - y) / distance
-                found += [(x + along * ex - side * across * ey, y + along * ey + side * across * ex) for side in (-1, 1)]
-        for x, y, direction, *_ in rays:
-            dx, dy = math.cos(direction), math.sin(direction)
-            for u, v, s in circles:
-                along, across = dx * (u - x) + dy * (v - y), dx * (v - y) - dy * (u - x)
-                if abs(across) <= s:
-                    half = math.sqrt(s * s - across * across)
-                    found += [(x + t * dx, y + t * dy) for t in (along - half, along + half)]
+        found = [place for one, other in combinations(circles, 2) for place in circles_meet(one, other)]
+        found += [place for ray in rays for circle in circles for place in ray_meets(ray, circle)]
         for (x, y, one, *_), (u, v, other, *_) in combinations(rays, 2):
             cross = math.sin(other - one)
             if abs(cross) > 1e-12:
@@ -161,6 +157,32 @@ class Layout:
             angles.append(self._angles_of(curve(finer), i, j, slack_mm))
         return np.sort(np.concatenate(angles))
 
+    def curve_mm(self, i, j, angle):
+        """How long the curve of an equal hand-over angle is, without what either arm may not use: an arc of a circle through both bases."""
+        (ax, ay), (bx, by) = self.bases[[i, j]]
+        sine = math.copysign(max(abs(math.sin(angle)), FLAT_RAD), math.sin(angle))
+        radius = math.hypot(bx - ax, by - ay) / (2 * abs(sine))
+        up = math.cos(angle) / (2 * sine)
+        circle = ((ax + bx) / 2 + up * (by - ay), (ay + by) / 2 - up * (bx - ax), radius)
+        ends = [(ax, ay), (bx, by)]
+        ends += [place for other in self.circles(i, j) for place in circles_meet(other, circle)]
+        ends += [place for ray in self.rays(i, j) for place in ray_meets(ray, circle)]
+        turns = np.sort(np.arctan2(*(np.array(ends) - circle[:2]).T[::-1]))
+        width = np.diff(turns, append=turns[0] + 2 * math.pi)
+        middle = turns + width / 2
+        place = circle[:2] + radius * np.stack([np.cos(middle), np.sin(middle)], -1)
+        # The other arc of the circle has the angle on the other side of pi.
+        usable = (np.abs(wrapped(self.hand_over_angle(place, i, j) - angle)) < 1e-3) & (self.margin(place, (i, j)).min(-1) >= 0)
+        return float(radius * width[usable].sum())
+
+    def counts(self, i, j, angles, step_rad):
+        """Which of the sorted ``angles`` (n,), sampled ``step_rad`` apart, are surely of a space that is not narrow all over: bool (n,)."""
+        counted = np.zeros(len(angles), bool)
+        for group in np.split(np.arange(len(angles)), np.flatnonzero(np.diff(angles) > 2 * step_rad) + 1):
+            tried = sorted(set(np.linspace(0, len(group) - 1, 41).astype(int)), key=lambda index: abs(2 * index - len(group)))
+            counted[group] = any(self.curve_mm(i, j, angles[group[index]]) > SURE * NARROW_MM for index in tried if len(group))
+        return counted
+
     def _angles_of(self, place, i, j, slack_mm):
         good = self.margin(place, (i, j)).min(-1) >= -slack_mm
         return self.hand_over_angle(place[good], i, j)
@@ -197,6 +219,29 @@ class Layout:
             places = np.concatenate([places, draw.permutation(more)])
         pose = np.concatenate([places[: 2 * count], draw.uniform(-math.pi, math.pi, (2 * count, 1))], -1)
         return pose[:count], pose[count:]
+
+
+def circles_meet(one, other):
+    """Places where two circles (x, y, radius) meet."""
+    (x, y, r), (u, v, s) = one, other
+    distance = math.hypot(u - x, v - y)
+    if distance == 0 or not abs(r - s) <= distance <= r + s:
+        return []
+    along = (r * r - s * s + distance * distance) / (2 * distance)
+    across = math.sqrt(max(r * r - along * along, 0.0))
+    ex, ey = (u - x) / distance, (v - y) / distance
+    return [(x + along * ex - side * across * ey, y + along * ey + side * across * ex) for side in (-1, 1)]
+
+
+def ray_meets(ray, circle):
+    """Places where the line of a ray (x, y, direction, ...) meets a circle (x, y, radius)."""
+    (x, y, direction, *_), (u, v, s) = ray, circle
+    dx, dy = math.cos(direction), math.sin(direction)
+    along, across = dx * (u - x) + dy * (v - y), dx * (v - y) - dy * (u - x)
+    if abs(across) > s:
+        return []
+    half = math.sqrt(s * s - across * across)
+    return [(x + t * dx, y + t * dy) for t in (along - half, along + half)]
 
 
 def random_arm(draw, name, ring=None):
@@ -301,3 +346,27 @@ def _disc_in_mid_curve(draw, layout):
             x, y = curve[length // 2]
             return _disc(x, y, draw.uniform(2, chord / 2 - HALF_DIAGONAL_MM - 5))
     return None
+
+
+def layout_with_a_sliver(less_mm=0.0):
+    """Three arms and four discs: arms 0 and 2 share, beside a large space, a triangle with sides of 60 to 101 nm between both rings and a
+    yaw limit. It grows as the least radius of the rings gets less.
+    """
+    low, high = 118.13767059683671 - less_mm, 217.79420120278942
+    placed = [
+        ("a-0", 470.777635359903, 325.26768757609466, 0.7277683430718525, math.pi),
+        ("arm 1", 393.37480456128355, 332.0054156637743, -0.15964859027898548, 2.5681689335927045),
+        ("c-2", 259.7358734081069, 332.2137624127693, -0.8096165083891043, 1.242017139014224),
+    ]
+    discs = [
+        (326.26743321845817, 148.2252672419632, 14.212144365037801),
+        (294.5040542421485, 61.48929117095875, 12.882522449395086),
+        (446.6484730280467, 173.6903958718725, 30.729324844980734),
+        (586.2307151888295, 379.34540839515785, 22.355705995258223),
+    ]
+    ring = {"r_min_mm": low, "r_max_mm": high}
+    arms = [
+        {"name": name, "x_mm": x, "y_mm": y, "facing_rad": facing, "yaw_range_rad": [-half, half]} | ring
+        for name, x, y, facing, half in placed
+    ]
+    return Layout(arms, [_disc(*disc) for disc in discs])

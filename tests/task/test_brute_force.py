@@ -67,6 +67,20 @@ def test_no_angle_is_claimed_that_no_place_has():
     assert tried > 50
 
 
+def test_the_length_of_a_curve_of_equal_angle_is_that_of_its_places():
+    draw, points, tried = np.random.default_rng(5), 20_000, 0
+    for layout in layouts(8):
+        for i, j in combinations(range(layout.count), 2):
+            for place in layout.sample_shared(i, j, 100, draw)[:4]:
+                angle = float(layout.hand_over_angle(place, i, j))
+                around_mm = math.pi * math.dist(*layout.bases[[i, j]]) / max(abs(math.sin(angle)), 1e-9)
+                if around_mm < 1e5:
+                    usable = equal_angle_curve(layout, i, j, place, points)[1]
+                    assert layout.curve_mm(i, j, angle) == pytest.approx(usable.mean() * around_mm, abs=8 * around_mm / points)
+                    tried += 1
+    assert tried > 50
+
+
 def test_the_shipped_pair_offers_its_angles():
     inner = np.flatnonzero(AngleSums(ring(2)).inner[0, 1]) * 0.02
     least = 2 * math.degrees(math.asin(180 / 230))  # at the tips of the lens

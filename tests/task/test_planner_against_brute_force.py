@@ -13,7 +13,7 @@ from marl_handover.config import TaskConfig
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Rules
 from tests.oracles.angle_sums import AngleSums, moved
-from tests.oracles.layouts import random_layout, wrapped
+from tests.oracles.layouts import layout_with_a_sliver, random_layout, wrapped
 
 EPSILONS_DEG = (5.0, 1.0)
 REACH_MM = 1e-3
@@ -90,6 +90,36 @@ def faults_in_execution(layout, rules, planner, start, goal, planned):
 )
 def test_nothing_shorter_is_found_and_every_plan_comes_true(count, mixed, close, discs):
     judge(1, count, mixed, close, discs, 0)
+
+
+SLIVER_MM = np.array(
+    [(367.00045913304876, 381.7194980734307), (367.0005074763817, 381.7195869444416), (367.00043380843704, 381.7195529444902)]
+)
+"""Corners of the triangle of :func:`layout_with_a_sliver`."""
+
+
+def test_a_plan_through_a_place_narrower_than_a_micrometre_is_none():
+    """Arms 0, 2 and 1 turn the block as it has to be within 0.01 degrees, by plane geometry; but the first place is 16 nm inside."""
+    layout = layout_with_a_sliver()
+    start = np.array([[547.0192711551852, 139.31583000350327, 0.7086563385119176]])
+    goal = np.array([[477.78644788515464, 523.4686260235636, -0.3067902217114207]])
+    middle, ample = SLIVER_MM.mean(0, keepdims=True), np.array([[260.84865971846625, 178.56259474102598]])
+    assert 1.6e-5 < layout.margin(middle, (0, 2)).min() < 2e-5
+    assert layout.margin(ample, (1, 2)).min() > 15
+    pose = start
+    for arm, place in ((0, middle), (2, ample), (1, goal)):
+        pose = moved(layout, pose, np.array([arm]), place[:, :2])
+    assert abs(wrapped(pose[0, 2] - goal[0, 2])) < math.radians(0.01)
+    rules = Rules(layout_cell(layout.arms, layout.obstacles), TaskConfig(layout="raw"))
+    assert ExactPlanner(rules).plan(start, goal).transfers == [5]
+    sums = AngleSums(layout)
+    assert [sums.fewest(start, goal, rules.epsilon_rad, outer=outer).tolist() for outer in (False, True)] == [[5], [3]]
+
+
+@pytest.mark.parametrize("less_mm", [0.0, 1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.1, 1.0])
+def test_nothing_shorter_is_found_where_a_place_hardly_is_one(less_mm):
+    said = faults_of(layout_with_a_sliver(less_mm), np.random.default_rng(1))
+    assert not said
 
 
 @pytest.mark.slow
