@@ -21,8 +21,11 @@ Layers = Mapping[str, Callable[[Array], Array]]
 HARMONICS = 4
 """Multiples of an angle that the network sees, and that what arms tell each other is turned by."""
 
-FACTS = 12
+FACTS = 13
 """Numbers that :func:`arm_facts` says of an arm at an angle."""
+
+MARGIN_SLOPE = 20.0
+"""How steeply a margin goes from -1 to 1 where the error is epsilon, in units of epsilon."""
 
 LOG_STD_RANGE = (-6.0, 1.0)
 SCORE = 8.0
@@ -109,11 +112,18 @@ class HandoverGraphs:
         self.outgoing = xp.full((len(there), int(degree.max()) if len(there) else 0), -1, dtype=number.dtype, **_on(row))
         self.outgoing[self.giver, number - first[self.giver]] = number
 
-    def mirrored(self) -> HandoverGraphs:
-        """The graphs of the mirrored problems."""
+    def with_mirror(self) -> HandoverGraphs:
+        """The graphs, and after them those of the mirrored problems."""
+        xp = namespace(self.angle)
         other: HandoverGraphs = object.__new__(HandoverGraphs)
         other.__dict__ |= self.__dict__
-        other.angle, other.goal_angle, other.middle = -self.angle, -self.goal_angle, -self.middle
+        for name in ("reaches_goal", "epsilon", "half"):
+            setattr(other, name, xp.concat(2 * [getattr(self, name)]))
+        for name in ("angle", "goal_angle", "middle"):
+            setattr(other, name, xp.concat([getattr(self, name), -getattr(self, name)]))
+        arms, edges = len(self.arm), len(self.giver)
+        other.giver, other.receiver = (xp.concat([rows, rows + arms]) for rows in (self.giver, self.receiver))
+        other.outgoing = xp.concat([self.outgoing, xp.where(self.outgoing < 0, -1, self.outgoing + edges)])
         return other
 
     def summed(self, values: Array) -> Array:
@@ -121,7 +131,7 @@ class HandoverGraphs:
         xp = namespace(values)
         if xp is np:
             return np.concatenate([values, np.zeros_like(values[:1])])[self.outgoing].sum(1)
-        return xp.zeros(len(self.arm), *values.shape[1:], **_on(values)).index_add(0, self.giver, values)
+        return xp.zeros(len(self.angle), *values.shape[1:], **_on(values)).index_add(0, self.giver, values)
 
 
 def embedded(layers: Layers, shape: GraphShape, graph: HandoverGraphs) -> Array:
@@ -129,11 +139,11 @@ def embedded(layers: Layers, shape: GraphShape, graph: HandoverGraphs) -> Array:
     xp = namespace(graph.angle)
     reach, goal = graph.reaches_goal[:, None], _harmonics(graph.goal_angle)
     known = layers["embed"](xp.concat([reach, xp.log(graph.epsilon)[:, None], reach * goal], -1))
-    half = graph.half[:, None]
+    half, turn = graph.half[:, None], _harmonics(graph.middle)
     there = reach[graph.receiver]
     fixed = xp.concat([half, xp.cos(half), xp.sin(half), there, there * _harmonics(graph.goal_angle[graph.receiver] - graph.middle)], -1)
     for _ in range(shape.rounds):
-        told = xp.concat([known[graph.giver], _turned(known[graph.receiver], -graph.middle), fixed], -1)
+        told = xp.concat([known[graph.giver], _turned_back(known[graph.receiver], turn), fixed], -1)
         message = layers["message_out"](_positive(layers["message"](told)))
         weight = xp.exp(xp.clip(message[:, -1:], -SCORE, SCORE))
         total = graph.summed(weight) + 1e-6
@@ -151,16 +161,14 @@ def arm_facts(graph: HandoverGraphs, arm: Array, angle: Array, slack: bool = Tru
     """
     xp = namespace(angle)
     reach, epsilon, error = graph.reaches_goal[arm], graph.epsilon[arm], wrap(angle - graph.goal_angle[arm])
-    margin = reach * (1 + xp.clip(4 * (1 - abs(error) / epsilon), -1, 1)) - 1
-    away = onward(graph, arm, angle)[0] if slack else 0 * angle
-    facts = [
-        reach,
-        margin,
-        reach * xp.clip(error / epsilon / 4, -1, 1),
-        away / math.pi,
-        xp.clip(away / epsilon / 4, -1, 1),
-        xp.log(epsilon),
-    ]
+    finish = reach * (1 + xp.clip(MARGIN_SLOPE * (1 - abs(error) / epsilon), -1, 1)) - 1
+    facts = [reach, finish, reach * xp.clip(error / epsilon / 4, -1, 1), xp.log(epsilon)]
+    if slack:
+        away = onward(graph, arm, angle)[0]
+        relative = away / epsilon
+        facts += [away / math.pi, xp.clip(relative / 4, -1, 1), xp.clip(MARGIN_SLOPE * (1 + relative), -1, 1)]
+    else:
+        facts += 3 * [0 * angle]
     return xp.concat([xp.stack(facts, -1), reach[..., None] * _harmonics(error, 3)], -1)
 
 
@@ -183,7 +191,8 @@ def onward(graph: HandoverGraphs, arm: Array, angle: Array) -> tuple[Array, Arra
 def hand_over_value(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known: Array, arm: Array, angle: Array) -> Array:
     """Twin values (2, ...) of handing the object to rows of arms (...) such that they carry it at angles (...)."""
     xp = namespace(angle)
-    told = xp.concat([_turned(known[arm], -angle), arm_facts(graph, arm, angle, shape.slack), _harmonics(angle)], -1)
+    turn = _harmonics(angle)
+    told = xp.concat([_turned_back(known[arm], turn), arm_facts(graph, arm, angle, shape.slack), turn], -1)
     values = []
     for twin in range(2):
         hidden = _positive(_normalised(layers[f"value_{twin}"](told)))
@@ -191,29 +200,30 @@ def hand_over_value(layers: Layers, shape: GraphShape, graph: HandoverGraphs, kn
     return xp.stack(values)
 
 
-def finish_value(layers: Layers, shape: GraphShape, graph: HandoverGraphs, arm: Array, angle: Array) -> Array:
-    """Value (...) of finishing with rows of arms (...) that carry the object at angles (...)."""
-    hidden = _positive(layers["finish"](arm_facts(graph, arm, angle, shape.slack)))
+def finish_value(layers: Layers, facts: Array) -> Array:
+    """Value (...) of finishing with arms of which :func:`arm_facts` says ``facts`` (..., :data:`FACTS`)."""
+    hidden = _positive(layers["finish"](facts))
     value: Array = layers["finish_out"](_positive(layers["finish_hidden"](hidden)))[..., 0]
     return value
 
 
-def best_places(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known: Array, angle: Array) -> tuple[Array, Array]:
-    """Where in each interval the giver, which carries the object at ``angle`` (E,), hands over: mean and log standard deviation
-    (E, components) of the place before the tanh that brings it into (-1, 1), the interval's ends.
+def best_places(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known: Array, facts: Array) -> tuple[Array, Array]:
+    """Where in each interval the giver hands over: mean and log standard deviation (E, components) of the place before the tanh that
+    brings it into (-1, 1), the interval's ends. ``facts`` (A, :data:`FACTS`) are those of the arms at their angles.
     """
-    xp, middle, half = namespace(angle), graph.middle, graph.half
-    there = angle + middle
+    xp, half, angle = namespace(facts), graph.half, graph.angle[graph.giver]
+    there = angle + graph.middle
+    turn = _harmonics(there)
     reach, missing = graph.reaches_goal[graph.receiver], wrap(graph.goal_angle[graph.receiver] - there)
     slack, change = onward(graph, graph.receiver, there) if shape.slack else (0 * there - math.pi, 0 * there)
     width = half + 0.05
     own = [half, reach * xp.clip(missing / width, -2, 2), xp.clip(change / width, -2, 2), (slack > -math.pi) + 0 * half, xp.log(width)]
     parts = [
-        _turned(known[graph.giver], -angle),
-        _turned(known[graph.receiver], -there),
-        arm_facts(graph, graph.giver, angle, shape.slack),
+        _turned_back(known[graph.giver], _harmonics(angle)),
+        _turned_back(known[graph.receiver], turn),
+        facts[graph.giver],
         arm_facts(graph, graph.receiver, there, shape.slack),
-        _harmonics(there),
+        turn,
         xp.stack(own, -1),
     ]
     hidden = _positive(layers["place_hidden"](_positive(layers["place"](xp.concat(parts, -1)))))
@@ -221,9 +231,9 @@ def best_places(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known:
     return out[:, : shape.components], xp.clip(out[:, shape.components :], *LOG_STD_RANGE)
 
 
-def arrival(graph: HandoverGraphs, angle: Array, place: Array) -> Array:
-    """Angles (E, m) at which receivers carry what givers at ``angle`` (E,) hand over at ``place`` (E, m) in (-1, 1)."""
-    return wrap((angle + graph.middle)[:, None] + graph.half[:, None] * place)
+def arrival(graph: HandoverGraphs, angle: Array, place: Array, edge: Array) -> Array:
+    """Angles (m, k) at which receivers carry what givers at ``angle`` (m,) hand over at ``place`` (m, k) in rows ``edge`` of intervals."""
+    return wrap((angle + graph.middle[edge])[:, None] + graph.half[edge, None] * place)
 
 
 class Choice(NamedTuple):
@@ -244,18 +254,17 @@ def branches(layers: Layers, shape: GraphShape, graph: HandoverGraphs) -> tuple[
 
     A problem and its mirror image are looked at alike: places are those that the actor says of either, values the mean of both.
     """
-    xp = namespace(graph.angle)
-    views = (graph, 1.0), (graph.mirrored(), -1.0)
-    known = [embedded(layers, shape, view) for view, _ in views]
-    said = [best_places(layers, shape, view, what, view.angle[view.giver])[0] for (view, _), what in zip(views, known, strict=True)]
-    place = xp.concat([sign * xp.tanh(mean) for (_, sign), mean in zip(views, said, strict=True)], -1)
-    arm, receiver = xp.arange(len(graph.arm), **_on(graph.arm)), graph.receiver[:, None] + xp.zeros_like(place, dtype=xp.int64)
-    value, finish = 0.0, 0.0
-    for (view, sign), what in zip(views, known, strict=True):
-        there = arrival(view, view.angle[view.giver], sign * place)
-        value = value + xp.amin(hand_over_value(layers, shape, view, what, receiver, there), 0) / 2
-        finish = finish + finish_value(layers, shape, view, arm, view.angle) / 2
-    return value, place, finish
+    xp, both, edges = namespace(graph.angle), graph.with_mirror(), len(graph.giver)
+    known = embedded(layers, shape, both)
+    facts = arm_facts(both, slice(None), both.angle, shape.slack)
+    said = xp.tanh(best_places(layers, shape, both, known, facts)[0])
+    place = xp.concat([said[:edges], -said[edges:]], -1)
+    tried = xp.concat([place, -place])
+    there = arrival(both, both.angle[both.giver], tried, slice(None))
+    receiver = both.receiver[:, None] + xp.zeros_like(tried, dtype=xp.int64)
+    value = xp.amin(hand_over_value(layers, shape, both, known, receiver, there), 0)
+    finish = finish_value(layers, facts)
+    return (value[:edges] + value[edges:]) / 2, place, (finish[: len(graph.arm)] + finish[len(graph.arm) :]) / 2
 
 
 def chosen(graph: HandoverGraphs, value: Array, place: Array, finish: Array, most: int | None = None) -> Choice:
@@ -300,19 +309,21 @@ def chosen(graph: HandoverGraphs, value: Array, place: Array, finish: Array, mos
 
 def _harmonics(angle: Array, count: int = HARMONICS) -> Array:
     xp = namespace(angle)
-    multiples = [(number + 1) * angle for number in range(count)]
-    return xp.stack([*map(xp.cos, multiples), *map(xp.sin, multiples)], -1)
+    multiples = xp.stack([(number + 1) * angle for number in range(count)], -1)
+    return xp.concat([xp.cos(multiples), xp.sin(multiples)], -1)
 
 
-def _turned(known: Array, angle: Array) -> Array:
-    """What is known (..., width), turned by angles (...): its first half stays, the rest are pairs that turn by multiples of the angle."""
+def _turned_back(known: Array, turn: Array) -> Array:
+    """What is known (..., width), turned back by angles with harmonics ``turn`` (..., 2 * :data:`HARMONICS`).
+
+    Its first half stays, the rest are pairs that turn by multiples of the angle.
+    """
     xp, kept = namespace(known), known.shape[-1] // 2
     pairs = known[..., kept:].reshape(*known.shape[:-1], 2, -1, HARMONICS)
-    turn = _harmonics(angle)
     cos, sin = turn[..., None, :HARMONICS], turn[..., None, HARMONICS:]
     first, second = pairs[..., 0, :, :], pairs[..., 1, :, :]
     shape = (*known.shape[:-1], -1)
-    return xp.concat([known[..., :kept], (first * cos - second * sin).reshape(shape), (first * sin + second * cos).reshape(shape)], -1)
+    return xp.concat([known[..., :kept], (first * cos + second * sin).reshape(shape), (second * cos - first * sin).reshape(shape)], -1)
 
 
 def _normalised(x: Array) -> Array:

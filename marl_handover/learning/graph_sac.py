@@ -22,6 +22,7 @@ from marl_handover.learning.graph_network import (
     GraphShape,
     HandoverGraphs,
     Layers,
+    arm_facts,
     arrival,
     best_places,
     branches,
@@ -130,12 +131,13 @@ class GraphSac(Algorithm):
         """A branch and a place drawn from the policy."""
         graph = self.graphs(observation)
         known = embedded(self.network.layers, self.shape, graph)
-        sampled = self._sampled(graph, known, graph.angle)
+        facts = arm_facts(graph, self._arms(graph), graph.angle, self.shape.slack)
+        sampled = self._sampled(graph, known, facts)
         place = torch.where(
             self._uniform(sampled.place.shape) < self.config.random_place, self._anywhere(sampled.place.shape), sampled.place
         )
         value = self._value(self.network.layers, graph, known, graph.angle, place)
-        finish = finish_value(self.network.layers, self.shape, graph, torch.arange(len(graph.arm), device=self.device), graph.angle)
+        finish = finish_value(self.network.layers, facts)
         noise = self._gumbel(value.shape), self._gumbel(finish.shape)
         # Some cells follow the likeliest branch: where that goes in circles, its states must get into the memory.
         steady = torch.arange(graph.count, device=self.device) < int(self.config.deterministic_env_fraction * graph.count)
@@ -155,12 +157,13 @@ class GraphSac(Algorithm):
         over = batch["next", "terminated"]
         graph = self.graphs(torch.where(over, batch["observation"], batch["next", "observation"]))
         known = embedded(self.network.layers, self.shape, graph)
-        sampled = self._sampled(graph, known.detach(), graph.angle)
-        arm = torch.arange(len(graph.arm), device=self.device)
+        arm = self._arms(graph)
+        facts = arm_facts(graph, arm, graph.angle, self.shape.slack)
+        sampled = self._sampled(graph, known.detach(), facts)
         with torch.no_grad():
-            target, share = self._soft_value(graph, arm, sampled)
+            target, share = self._soft_value(graph, facts, sampled)
         value = hand_over_value(self.network.layers, self.shape, graph, known, arm, graph.angle)
-        finish = finish_value(self.network.layers, self.shape, graph, arm, graph.angle)
+        finish = finish_value(self.network.layers, facts)
         loss_place = (value - target).square().mean(1).sum()
         loss_finish = (finish - self._finish_reward(graph)).square().mean()
         self.critic_optimizer.zero_grad()
@@ -173,13 +176,13 @@ class GraphSac(Algorithm):
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), self.config.tau)
         return {"loss_critic": loss_place.detach(), "loss_finish": loss_finish.detach(), "loss_actor": loss_actor.detach()}
 
-    def _soft_value(self, graph: HandoverGraphs, arm: Tensor, sampled: Sampled) -> tuple[Tensor, Tensor]:
+    def _soft_value(self, graph: HandoverGraphs, facts: Tensor, sampled: Sampled) -> tuple[Tensor, Tensor]:
         """What handing over to each arm is worth by what it can do next, (A,), and the share (E, components) of each branch of it."""
         own, scale = self.config, self.config.reward_scale
         known = embedded(self.average.layers, self.shape, graph)
         value = self._value(self.average.layers, graph, known, graph.angle, sampled.place)
         value = value - own.place_temperature * sampled.log_prob.clamp(-3.0, 6.0)
-        finish = finish_value(self.average.layers, self.shape, graph, arm, graph.angle)
+        finish = finish_value(self.average.layers, facts)
         best = value.new_full(finish.shape, -torch.inf).scatter_reduce(0, graph.giver, value.amax(-1), "amax").maximum(finish)
         weight = ((value - best[graph.giver, None]) / self.temperature).exp()
         weight_finish = ((finish - best) / self.temperature).exp()
@@ -202,29 +205,47 @@ class GraphSac(Algorithm):
             parameter.requires_grad_(False)
         value = self._value(self.network.layers, graph, known, graph.angle, sampled.place)
         loss = ((0.1 + share) * (own.place_temperature * sampled.log_prob - value)).mean()
-        with torch.no_grad():
-            component = torch.randint(own.mixture_components, (own.candidates,), generator=self.generator, device=self.device)
-            beside = (sampled.mean[:, component] + self._nearby((len(graph.giver), own.candidates))).clamp(-1.0, 1.0)
-            tried = torch.cat([sampled.mean, self._anywhere((len(graph.giver), own.candidates)), beside], -1)
-            worth = self._value(self.network.layers, graph, known, graph.angle, tried)
-            best, taken = worth[:, : own.mixture_components].max(-1, keepdim=True)
-            gain = worth[:, own.mixture_components :] - best - own.candidate_margin
+        some = torch.arange(int(own.candidate_share * len(graph.giver)), device=self.device)
+        loss = loss + own.candidate_weight * self._pull(graph, known, sampled.mean[some], some) if len(some) else loss
         for parameter in self.network.parts(of_actor=False):
             parameter.requires_grad_(True)
-        distance = (sampled.mean.gather(1, taken) - tried[:, own.mixture_components :]).square()
-        nearest = torch.where(gain > 0, distance.detach(), torch.inf).argmin(-1, keepdim=True)
-        pull = gain.gather(1, nearest).clamp(0.0, 1.0) * distance.gather(1, nearest)
-        return loss + own.candidate_weight * pull.mean()
+        return loss
 
-    def _sampled(self, graph: HandoverGraphs, known: Tensor, angle: Tensor) -> Sampled:
-        mean, log_std = best_places(self.network.layers, self.shape, graph, known, angle[graph.giver])
+    def _pull(self, graph: HandoverGraphs, known: Tensor, mean: Tensor, edge: Tensor) -> Tensor:
+        """Squared distance of the best mean (m, components) of rows of intervals (m,) to the *nearest* of some places that beat it.
+
+        The nearest, not the best: between two equally good regions the mean would be left in the bad middle.
+        """
+        own, components = self.config, mean.shape[-1]
+        with torch.no_grad():
+            component = torch.randint(components, (own.candidates,), generator=self.generator, device=self.device)
+            beside = (mean[:, component] + self._nearby((len(edge), own.candidates))).clamp(-1.0, 1.0)
+            tried = torch.cat([mean, self._anywhere((len(edge), own.candidates)), beside], -1)
+            worth = self._value(self.network.layers, graph, known, graph.angle, tried, edge)
+            best, taken = worth[:, :components].max(-1, keepdim=True)
+            gain = worth[:, components:] - best - own.candidate_margin
+        distance = (mean.gather(1, taken) - tried[:, components:]).square()
+        nearest = torch.where(gain > 0, distance.detach(), torch.inf).argmin(-1, keepdim=True)
+        return (gain.gather(1, nearest).clamp(0.0, 1.0) * distance.gather(1, nearest)).mean()
+
+    def _arms(self, graph: HandoverGraphs) -> Tensor:
+        return torch.arange(len(graph.arm), device=self.device)
+
+    def _sampled(self, graph: HandoverGraphs, known: Tensor, facts: Tensor) -> Sampled:
+        mean, log_std = best_places(self.network.layers, self.shape, graph, known, facts)
         place, log_prob = squashed(mean, log_std, self._noise(mean.shape))
         return Sampled(place, log_prob, mean.tanh())
 
-    def _value(self, layers: Layers, graph: HandoverGraphs, known: Tensor, angle: Tensor, place: Tensor) -> Tensor:
-        """The lower of both critics' values (E, m) of handing over at ``place`` (E, m) by arms that carry the object at ``angle`` (A,)."""
-        there = arrival(graph, angle[graph.giver], place)
-        value: Tensor = hand_over_value(layers, self.shape, graph, known, graph.receiver[:, None].expand_as(there), there).amin(0)
+    def _value(
+        self, layers: Layers, graph: HandoverGraphs, known: Tensor, angle: Tensor, place: Tensor, edge: Tensor | None = None
+    ) -> Tensor:
+        """The lower of both critics' values (m, k) of handing over at ``place`` (m, k) in the rows ``edge`` (m,) of intervals, or in all.
+
+        Arms carry the object at ``angle`` (A,).
+        """
+        rows = torch.arange(len(graph.giver), device=self.device) if edge is None else edge
+        there = arrival(graph, angle[graph.giver[rows]], place, rows)
+        value: Tensor = hand_over_value(layers, self.shape, graph, known, graph.receiver[rows, None].expand_as(there), there).amin(0)
         return value
 
     def _action(self, observation: Tensor, graph: HandoverGraphs, choice: Choice) -> Tensor:
