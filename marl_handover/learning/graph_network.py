@@ -21,11 +21,13 @@ Layers = Mapping[str, Callable[[Array], Array]]
 HARMONICS = 4
 """Multiples of an angle that the network sees, and that what arms tell each other is turned by."""
 
-FACTS = 13
+FACTS = 12
 """Numbers that :func:`arm_facts` says of an arm at an angle."""
 
-MARGIN_SLOPE = 20.0
-"""How steeply a margin goes from -1 to 1 where the error is epsilon, in units of epsilon."""
+MARGIN_SLOPE, FINISH_SLOPE = 4.0, 20.0
+"""How steeply a margin goes from -1 to 1 where an error is epsilon, in units of epsilon. The steep one is for who decides to finish only:
+what is to lead somewhere must not be flat.
+"""
 
 LOG_STD_RANGE = (-6.0, 1.0)
 SCORE = 8.0
@@ -66,7 +68,7 @@ def layer_sizes(shape: GraphShape) -> dict[str, tuple[int, int]]:
         "message_out": (width, width + 1),
         "revise": (2 * width + 1, width),
         "revise_out": (width, width),
-        "finish": (FACTS, 32),
+        "finish": (FACTS + 1, 32),
         "finish_hidden": (32, 32),
         "finish_out": (32, 1),
         "place": (2 * width + FACTS + told + 5, width),
@@ -126,6 +128,18 @@ class HandoverGraphs:
         other.outgoing = xp.concat([self.outgoing, xp.where(self.outgoing < 0, -1, self.outgoing + edges)])
         return other
 
+    def hopeless(self) -> Array:
+        """Problems (n,) in which no arm that reaches the goal can ever be handed the object: bool."""
+        xp, shape = namespace(self.angle), (self.count, self.num_arms)
+        passes = xp.zeros((*shape, self.num_arms), dtype=xp.float32, **_on(self.angle))
+        passes[self.problem[self.giver], self.arm[self.giver], self.arm[self.receiver]] = 1.0
+        carries, finishes = (xp.zeros(shape, dtype=xp.float32, **_on(self.angle)) for _ in range(2))
+        carries[self.problem, self.arm] = 1.0 * self.reaches_object
+        finishes[self.problem, self.arm] = 1.0 * self.reaches_goal
+        for _ in range(self.num_arms - 1):
+            carries = xp.clip(carries + (carries[:, None] @ passes)[:, 0], 0, 1)
+        return (carries * finishes).sum(-1) == 0
+
     def summed(self, values: Array) -> Array:
         """Sums (A, ...) over the intervals that each arm gives over, of ``values`` (E, ...)."""
         xp = namespace(values)
@@ -161,14 +175,15 @@ def arm_facts(graph: HandoverGraphs, arm: Array, angle: Array, slack: bool = Tru
     """
     xp = namespace(angle)
     reach, epsilon, error = graph.reaches_goal[arm], graph.epsilon[arm], wrap(angle - graph.goal_angle[arm])
-    finish = reach * (1 + xp.clip(MARGIN_SLOPE * (1 - abs(error) / epsilon), -1, 1)) - 1
-    facts = [reach, finish, reach * xp.clip(error / epsilon / 4, -1, 1), xp.log(epsilon)]
-    if slack:
-        away = onward(graph, arm, angle)[0]
-        relative = away / epsilon
-        facts += [away / math.pi, xp.clip(relative / 4, -1, 1), xp.clip(MARGIN_SLOPE * (1 + relative), -1, 1)]
-    else:
-        facts += 3 * [0 * angle]
+    away = onward(graph, arm, angle)[0] if slack else 0 * angle
+    facts = [
+        reach,
+        reach * (1 + xp.clip(MARGIN_SLOPE * (1 - abs(error) / epsilon), -1, 1)) - 1,
+        reach * xp.clip(error / epsilon / 4, -1, 1),
+        away / math.pi,
+        xp.clip(away / epsilon / 4, -1, 1),
+        xp.log(epsilon),
+    ]
     return xp.concat([xp.stack(facts, -1), reach[..., None] * _harmonics(error, 3)], -1)
 
 
@@ -202,7 +217,9 @@ def hand_over_value(layers: Layers, shape: GraphShape, graph: HandoverGraphs, kn
 
 def finish_value(layers: Layers, facts: Array) -> Array:
     """Value (...) of finishing with arms of which :func:`arm_facts` says ``facts`` (..., :data:`FACTS`)."""
-    hidden = _positive(layers["finish"](facts))
+    xp = namespace(facts)
+    steep = xp.clip(FINISH_SLOPE / MARGIN_SLOPE * facts[..., 1:2], -1, 1)
+    hidden = _positive(layers["finish"](xp.concat([facts, steep], -1)))
     value: Array = layers["finish_out"](_positive(layers["finish_hidden"](hidden)))[..., 0]
     return value
 
@@ -210,6 +227,9 @@ def finish_value(layers: Layers, facts: Array) -> Array:
 def best_places(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known: Array, facts: Array) -> tuple[Array, Array]:
     """Where in each interval the giver hands over: mean and log standard deviation (E, components) of the place before the tanh that
     brings it into (-1, 1), the interval's ends. ``facts`` (A, :data:`FACTS`) are those of the arms at their angles.
+
+    The first component starts from the place nearest to where the receiver can finish, the second from the nearest to where it can hand
+    over to an arm that can; what is learned is the difference.
     """
     xp, half, angle = namespace(facts), graph.half, graph.angle[graph.giver]
     there = angle + graph.middle
@@ -228,7 +248,9 @@ def best_places(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known:
     ]
     hidden = _positive(layers["place_hidden"](_positive(layers["place"](xp.concat(parts, -1)))))
     out = layers["place_out"](hidden)
-    return out[:, : shape.components], xp.clip(out[:, shape.components :], *LOG_STD_RANGE)
+    starts = [_before_tanh(reach * missing / half), *([_before_tanh(change / half)] if shape.slack else [])]
+    starts = starts[: shape.components] + [0 * half] * (shape.components - len(starts))
+    return out[:, : shape.components] + xp.stack(starts, -1), xp.clip(out[:, shape.components :], *LOG_STD_RANGE)
 
 
 def arrival(graph: HandoverGraphs, angle: Array, place: Array, edge: Array) -> Array:
@@ -305,6 +327,11 @@ def chosen(graph: HandoverGraphs, value: Array, place: Array, finish: Array, mos
     at = place[edge, option % m] if len(place) else 0.0 * best
     choice = final, arm, edge, at, taken(flat, best)
     return Choice(*(each[:, 0] for each in choice)) if most is None else Choice(*choice)
+
+
+def _before_tanh(place: Array) -> Array:
+    xp = namespace(place)
+    return xp.arctanh(xp.clip(place, -0.995, 0.995))
 
 
 def _harmonics(angle: Array, count: int = HARMONICS) -> Array:

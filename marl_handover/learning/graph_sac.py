@@ -49,8 +49,10 @@ class GraphNetwork(nn.ModuleDict):
         super().__init__({name: nn.Linear(*size) for name, size in layer_sizes(shape).items()})
         bias = self["place_out"].bias
         assert isinstance(bias, nn.Parameter)
-        with torch.no_grad():  # components start apart, so that they do not learn the same thing
-            bias[: shape.components] = torch.linspace(-1.0, 1.0, shape.components) if shape.components > 1 else 0.0
+        free = max(shape.components - 2, 0)
+        with torch.no_grad():  # components that start from nowhere start apart, so that they do not learn the same thing
+            bias[: shape.components] = 0.0
+            bias[shape.components - free : shape.components] = torch.linspace(-1.0, 1.0, free) if free > 1 else 0.0
 
     @property
     def layers(self) -> Layers:

@@ -56,6 +56,8 @@ class GraphPolicy(SupervisorPolicy):
         if rules.external_finish:  # the final transfer is not the supervisor's
             finish = np.full_like(finish, -math.inf)
         choice = chosen(graph, value, place, finish, most)
+        hopeless = graph.hopeless().reshape(-1, *[1] * (choice.value.ndim - 1))
+        choice = choice._replace(value=np.where(hopeless, -math.inf, choice.value))
         return self._action(graph, choice).reshape(*lead, *choice.final.shape[1:], -1)
 
     def _alone(self, pose: Floats, goal: Floats, most: int | None) -> Floats:
