@@ -29,7 +29,7 @@ help:
 	@echo "make check      style, types and import layers; make format repairs the style"
 	@echo "make bench      measure motion planning, the safety gate, speed, and learning against Stable-Baselines3 (hours)"
 	@echo "make docs       build the documentation site into site/; warnings are errors"
-	@echo "make pretrained train the three policies that are shipped"
+	@echo "make pretrained train the four policies that are shipped"
 	@echo "make wheel      build a wheel into dist/"
 
 $(STAMP): pyproject.toml constraints.txt
@@ -102,6 +102,8 @@ pretrained: $(STAMP)
 	$(BIN)/python scripts/export_policy.py runs/pretrained_b marl_handover/pretrained/b.npz
 	$(RUN) train preset=twin architecture=B out=runs/pretrained_twin
 	$(BIN)/python scripts/export_policy.py runs/pretrained_twin marl_handover/pretrained/twin.npz
+	$(RUN) train preset=any_cell out=runs/pretrained_any
+	$(BIN)/python scripts/export_policy.py runs/pretrained_any marl_handover/pretrained/any.npz
 
 wheel: $(STAMP)
 	$(BIN)/python -m build --wheel --outdir dist .
