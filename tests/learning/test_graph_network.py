@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from marl_handover.config import LayoutConfig, TaskConfig
 from marl_handover.learning.graph_network import (
     GraphShape,
     HandoverGraphs,
+    arm_facts,
     arrival,
     best_places,
     branches,
@@ -51,6 +53,13 @@ def seen():
     assert pool.n_arms.max() == 8
     assert ((pool.arcs[1] >= 0).sum(-1) > 1).any()  # some pairs offer several intervals
     return rules, observation
+
+
+def mirrored(graph):
+    """The graphs of the mirrored problems."""
+    other = copy(graph)
+    other.angle, other.goal_angle, other.middle = -graph.angle, -graph.goal_angle, -graph.middle
+    return other
 
 
 def in_numpy(shape, seed=0):
@@ -144,7 +153,7 @@ def test_of_a_mirror_image_the_mirrored_is_chosen(seen, shape):
     rules, observation = seen
     graph, layers = HandoverGraphs(observation, rules.cell.num_arms), in_numpy(shape)
     value, place, finish = branches(layers, shape, graph)
-    value_there, place_there, finish_there = branches(layers, shape, graph.mirrored())
+    value_there, place_there, finish_there = branches(layers, shape, mirrored(graph))
     half = shape.components  # the actor's places of either image are said one after the other
     np.testing.assert_allclose(np.roll(place_there, half, -1), -place, atol=1e-6)
     np.testing.assert_allclose(np.roll(value_there, half, -1), value, atol=1e-4)
@@ -201,19 +210,20 @@ def test_places_are_means_of_both_images_and_values_the_mean_of_the_lower_twins(
     rules, observation = seen
     shape, layers = SHAPES[2], in_numpy(SHAPES[2])
     graph = HandoverGraphs(observation, rules.cell.num_arms)
-    images = [(graph, 1.0), (graph.mirrored(), -1.0)]
+    images = [(graph, 1.0), (mirrored(graph), -1.0)]
     value, place, finish = branches(layers, shape, graph)
     said, worth, ends = [], [], []
     for view, sign in images:
         known = embedded(layers, shape, view)
-        mean, log_std = best_places(layers, shape, graph=view, known=known, angle=view.angle[view.giver])
+        facts = arm_facts(view, np.arange(len(view.arm)), view.angle, shape.slack)
+        mean, log_std = best_places(layers, shape, view, known, facts)
         assert (log_std >= -6).all()
         assert (log_std <= 1).all()
         said.append(sign * np.tanh(mean))
-        there = arrival(view, view.angle[view.giver], sign * place)
+        there = arrival(view, view.angle[view.giver], sign * place, np.arange(len(view.giver)))
         receiver = np.broadcast_to(view.receiver[:, None], there.shape)
         worth.append(np.minimum(*hand_over_value(layers, shape, view, known, receiver, there)))
-        ends.append(finish_value(layers, shape, view, np.arange(len(view.arm)), view.angle))
+        ends.append(finish_value(layers, facts))
     np.testing.assert_allclose(place, np.concatenate(said, -1), atol=1e-6)
     np.testing.assert_allclose(value, sum(worth) / 2, atol=1e-5)
     np.testing.assert_allclose(finish, sum(ends) / 2, atol=1e-5)

@@ -297,9 +297,31 @@ def test_where_no_arm_reaches_the_object_none_is_to_move():
     cell = model_of(3).cell
     far = np.array([[5000.0, 0.0, 0.0], [*cell.arms[0].at(200.0, 0.0), 0.0]])
     policy = random_policy(Rules(cell, TaskConfig()), far[1:], far[1:])
-    action = policy.act(far, far[::-1], np.full(2, -1))
+    action = policy.act(far, far[[1, 1]], np.full(2, -1))
     assert np.isnan(action[0]).all()
     assert np.isfinite(action[1]).all()
+
+
+def test_where_no_arm_that_reaches_the_goal_can_be_handed_the_object_none_is_to_move():
+    config = LayoutConfig(arms=[4, 5])
+    said = 0
+    for seed in range(20):
+        whole = LayoutPool.random(config, 1, np.random.default_rng(seed)).cell(0)
+        graph = whole.graph
+        centre = next((arm for arm in range(whole.num_arms) if len(graph.neighbours(arm)) > 1), 0)
+        cell = whole.with_arms([name for name in whole.names if name != whole.names[centre]])
+        start, goal = (part.numpy() for part in sample_problems(cell, 40, torch.Generator().manual_seed(seed)))
+        policy = random_policy(Rules(whole, TaskConfig()), start, goal).under(Rules(cell, TaskConfig()))
+        silent = np.isnan(policy.act(start, goal, np.full(40, -1))).all(-1)
+        parts = list(range(cell.num_arms))  # of the graph, by hand: arms that can pass to each other have the same
+        for _ in parts:
+            for i, j in cell.graph.edges:
+                parts[i] = parts[j] = min(parts[i], parts[j])
+        for row in range(40):
+            ends = [{parts[arm] for arm in np.flatnonzero(cell.reaches(pose[row]))} for pose in (start, goal)]
+            assert silent[row] == (not ends[0] & ends[1])
+        said += silent.sum()
+    assert said > 0
 
 
 def test_it_answers_observations_of_the_aec_environment():
