@@ -190,8 +190,6 @@ def _play_layouts(config: AssessmentConfig, policy: SupervisorPolicy, traced: bo
         raise InvalidSetting(
             "layouts", f"of {wanted.arms} arms", f"left out for policy={policy.name}, which acts in the one cell it is for"
         )
-    if config.outage is not None:
-        raise InvalidSetting("outage", config.outage.arm, "left out with layouts; problems=FILE takes cells of its own")
     if traced:
         raise InvalidSetting("trace", "a file", "left out with layouts, whose cells no line could name")
     _require_unpriced(rules, "random cells")
@@ -201,23 +199,32 @@ def _play_layouts(config: AssessmentConfig, policy: SupervisorPolicy, traced: bo
     solvable = {arms: posed for arms, posed in found.items() if len(posed.numbers)}
     if not solvable:
         raise WorkFailed(f"layouts: no plan solves any of {config.episodes} random problems; other layouts, or more episodes")
+    struck: list[Struck] = []
     with Bar(total=sum(len(posed.numbers) for posed in solvable.values()), unit="episode", shown=progress, leave=False) as bar:
         for arms, posed in solvable.items():
-            if policy.batch_of_cells:
+            if policy.batch_of_cells and config.outage is None:
                 parts[arms] = evaluate_in_cells(posed, lambda rules: policy.under(rules).act, config.seed, bar.update)
             else:
-                parts[arms] = _one_by_one(policy, posed, config.seed, bar)
+                parts[arms] = _one_by_one(config, policy, posed, bar, struck)
     by_arms = {str(arms): {**part.report(), "unsolvable": unsolvable[arms]} for arms, part in parts.items()}
     result = joined(list(parts.values()), [posed.numbers for posed in solvable.values()])
-    return result, str, rules, {**_noise(rules), "layouts": wanted.count, "unsolvable": sum(unsolvable.values()), "by_arms": by_arms}
+    shown = _noise(rules) if config.outage is None else {**_noise(rules), "outage": total(struck).report(config.outage)}
+    return result, str, rules, {**shown, "layouts": wanted.count, "unsolvable": sum(unsolvable.values()), "by_arms": by_arms}
 
 
-def _one_by_one(policy: SupervisorPolicy, posed: CellProblems, seed: int, bar: Bar) -> Evaluation:
-    """As :func:`evaluate_in_cells`, cell after cell."""
+def _one_by_one(config: AssessmentConfig, policy: SupervisorPolicy, posed: CellProblems, bar: Bar, struck: list[Struck]) -> Evaluation:
+    """As :func:`evaluate_in_cells`, cell after cell; under an outage, what became of each cell's episodes is added to ``struck``."""
     parts, numbers, timings = [], [], math.ceil(TIMED_DECISIONS / len(np.unique(posed.rules.cell.layout)))
     for rules, rows in posed.layouts():
-        act, problems = policy.under(rules).act, (posed.start[rows], posed.goal[rows])
-        parts.append(evaluate(rules, act, problems, _seed_at(seed, int(posed.numbers[rows[0]])), None, bar.update, timings=timings))
+        here = PosedProblems(rules.cell, True, posed.numbers[rows], posed.start[rows], posed.goal[rows])
+        supervisor, seed = policy.under(rules), _seed_of(config.seed, here)
+        if config.outage is not None:
+            run = OutageRun(supervisor, here, config.outage, seed)
+            parts.append(run.evaluate(bar.update, timings))
+            struck.append(run.struck)
+        else:
+            problems = here.start, here.goal
+            parts.append(evaluate(rules, supervisor.act, problems, seed, progress=bar.update, timings=timings))
         numbers.append(rows)
     return joined(parts, numbers)
 
@@ -241,11 +248,7 @@ def _require_unpriced(rules: Rules, what: str) -> None:
 
 def _seed_of(seed: int, posed: PosedProblems) -> int:
     """Of noise: cells that problems bring draw others than the command's."""
-    return _seed_at(seed, int(posed.numbers[0])) if posed.own else seed
-
-
-def _seed_at(seed: int, first: int) -> int:
-    return int(np.random.SeedSequence([seed, first]).generate_state(1)[0])
+    return int(np.random.SeedSequence([seed, int(posed.numbers[0])]).generate_state(1)[0]) if posed.own else seed
 
 
 def _all_of(observers: Sequence[Observer]) -> Observer | None:

@@ -136,6 +136,7 @@ def _row(suite: Suite, row: RowSpec, tasks: Sequence[Task], runs: list[Tree]) ->
     names = [spec.name for spec in suite.evaluations]
     content["evaluations"] = {name: _evaluation(content, name) for name in names if any(name in run["evaluations"] for run in runs)}
     content["by_arms"] = {name: found for name in content["evaluations"] if (found := _by_arms(content, name))}
+    content["outages"] = {name: told for name in content["evaluations"] if (told := _outage(content, name))}
     metrics: list[Metrics] = [_arrays(run["metrics"]) for run in runs if "metrics" in run]
     content["curves"] = _curves(metrics, _measures(suite)) if metrics else {}
     content["milestones"] = _milestones(metrics) if metrics else {}
@@ -174,6 +175,17 @@ def _by_arms(row: Tree, name: str) -> Tree:
             "decision_ms": float(np.median([part["decision_us"]["p50"] for part in parts])) / 1e3,
         }
     return found
+
+
+def _outage(row: Tree, name: str) -> Tree | None:
+    """What became of episodes in which an arm failed; of those that stayed solvable, the share that was solved."""
+    parts = [run["evaluations"][name]["outage"] for run in row["runs"] if "outage" in run["evaluations"].get(name, {})]
+    parts = [part for part in parts if part["solvable"]]
+    if not parts:
+        return None
+    solved = statistics.share_interval([part["solved_share"] for part in parts], [part["solvable"] for part in parts])
+    counts = {key: sum(part[key] for part in parts) for key in ("episodes", "solvable", "solved")}
+    return {"runs": len(parts), **counts, "solved_share": solved._asdict()}
 
 
 def _endings() -> list[str]:

@@ -72,6 +72,7 @@ TABLES = {
     "range": ("rows", "evaluations"),
     "paired": ("rows", "evaluations"),
     "arms": ("rows", "evaluations"),
+    "outage": ("rows", "evaluations"),
 }
 """The same of tables."""
 
@@ -136,7 +137,7 @@ class TableSpec:
     """One table, as Markdown and CSV."""
 
     name: str = ""
-    kind: str = ""  # evaluation, milestones, runs, comparison, range, arms, paired: two evaluations of the same problems
+    kind: str = ""  # evaluation, milestones, runs, comparison, range, arms, outage, paired: two evaluations of the same problems
     title: str = ""
     rows: list[str] = field(default_factory=list)
     evaluations: list[str] = field(default_factory=list)  # as of figures

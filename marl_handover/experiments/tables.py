@@ -69,6 +69,7 @@ def make_tables(results: Tree) -> list[Table]:
         "range": _range,
         "paired": _paired,
         "arms": _arms,
+        "outage": _outage,
     }
     tables = [Table(spec["name"], spec["title"] or spec["name"], *makers[spec["kind"]](results, spec)) for spec in results["tables"]]
     return [table for table in tables if table.rows]
@@ -284,6 +285,21 @@ def _arms(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
                 cells = [_interval(found["success_rate"], "{:.2f}", 100), _interval(found["steps_ratio"], "{:.3f}")]
                 rows.append([_text(int(arms)), _text(row["label"]), *counts, *cells, _plain(found["decision_ms"], "{:.2f}")])
     return columns, sorted(rows, key=lambda cells: cells[0].values[0])
+
+
+def _outage(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
+    """Episodes in which an arm went out of order: how many stayed solvable, and what share of these was solved."""
+    labels = {item["name"]: item["label"] or item["name"] for item in results["evaluations"]}
+    columns = [Column("row"), Column("evaluation"), Column("seeds")]
+    columns += [Column("an arm failed", ("episodes",)), Column("stayed solvable", ("solvable",))]
+    columns.append(_interval_column("of these solved, %", "solved_share"))
+    rows = []
+    for row in _wanted(results, spec["rows"]):
+        for name in (name for name in spec["evaluations"] or labels if name in row["outages"]):
+            found = row["outages"][name]
+            counts = [_plain(found[key]) for key in ("runs", "episodes", "solvable")]
+            rows.append([_text(row["label"]), _text(labels[name]), *counts, _interval(found["solved_share"], "{:.2f}", 100)])
+    return columns, rows
 
 
 def expected_lines(results: Tree, name: str, found: Tree) -> list[str]:

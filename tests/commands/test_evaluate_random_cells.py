@@ -93,6 +93,14 @@ def test_architecture_a_is_judged_too(tmp_path):
     assert report["success_rate"] == report["steps_ratio"] == 1.0
 
 
+@pytest.mark.parametrize("policy", ["exact", "pretrained_any"])
+def test_an_arm_goes_out_of_order_in_random_cells(tmp_path, policy):
+    report = report_of(tmp_path, f"policy={policy}", "layouts.arms=[3,4]", "outage.arm=random")
+    outage = report["outage"]
+    assert 0 < outage["solvable"] < outage["episodes"] <= report["episodes"]
+    assert outage["solved"] == outage["solvable"] if policy == "exact" else outage["solved"] > 0
+
+
 def test_the_table_has_a_line_for_each_number_of_arms(capsys):
     assert main(["evaluate", *FEW, "policy=exact", "layouts.arms=[3,3]"]) == 0
     shown = capsys.readouterr().out

@@ -24,8 +24,9 @@ evaluations:
   - {name: few, arguments: ["layouts.arms=[2,3]", layouts.count=6, episodes=40]}
   - {name: more, arguments: ["layouts.arms=[4,4]", layouts.count=3, episodes=20]}
   - {name: one, arguments: [episodes=20]}
+  - {name: outage, arguments: ["layouts.arms=[3,4]", layouts.count=4, episodes=20, outage.arm=random]}
 figures: [{name: growth, kind: arms, evaluations: [few, more]}]
-tables: [{name: by_arms, kind: arms, evaluations: [few, more]}]
+tables: [{name: by_arms, kind: arms, evaluations: [few, more]}, {name: outage, kind: outage}]
 """
 TINY = (
     "compile=off steps=512 num_envs=16 evaluation_interval=256 evaluation_episodes=20 checkpoint_interval=512 "
@@ -49,8 +50,8 @@ def results(tmp_path_factory):
 def test_what_stands_by_the_number_of_arms_is_what_the_runs_say(results):
     content, out = results
     for row in content["rows"]:
-        assert set(row["by_arms"]) == {"few", "more"}
-        for name, found in row["by_arms"].items():
+        assert set(row["by_arms"]) == {"few", "more", "outage"}
+        for name, found in ((name, row["by_arms"][name]) for name in ("few", "more")):
             reports = [json.loads((out / row["name"] / f"seed{seed}/{name}.json").read_text()) for seed in (0, 1)]
             assert sum(part["episodes"] for part in found.values()) == sum(report["episodes"] for report in reports)
             for arms, part in found.items():
@@ -63,11 +64,20 @@ def test_what_stands_by_the_number_of_arms_is_what_the_runs_say(results):
 
 def test_the_table_and_the_figure_have_every_number_of_arms(results):
     content, out = results
-    (table,) = make_tables(content)
+    table = make_tables(content)[0]
     assert [cells[0].text for cells in table.rows] == ["2", "2", "3", "3", "4", "4"]
     assert {cells[1].text for cells in table.rows} == {"exact", "greedy"}
     assert (out / "figures/growth.png").is_file()
     assert content["empty_figures"] == []
+
+
+def test_the_table_of_outages_tells_of_those_that_stayed_solvable(results):
+    content, out = results
+    for row, cells in zip(content["rows"], make_tables(content)[1].rows, strict=True):
+        parts = [json.loads((out / row["name"] / f"seed{seed}/outage.json").read_text())["outage"] for seed in (0, 1)]
+        assert [cell.values[0] for cell in cells[3:5]] == [sum(part[key] for part in parts) for key in ("episodes", "solvable")]
+        assert cells[5].values[0] == pytest.approx(sum(part["solved_share"] for part in parts) / 2)
+    assert content["rows"][0]["outages"]["outage"]["solved_share"]["value"] == 1.0
 
 
 def test_the_same_seeds_make_the_same_table(results, tmp_path):
@@ -81,7 +91,7 @@ def test_the_same_seeds_make_the_same_table(results, tmp_path):
     ("broken", "words"),
     [
         (("kind: arms, evaluations: [few, more]}]\ntables", "kind: arms}]\ntables"), "the kind arms names some in random cells: few, more"),
-        (("tables: [{name: by_arms, kind: arms, evaluations: [few, more]}]", "tables: [{name: t, kind: arms, evaluations: [one]}]"), "few"),
+        (("{name: by_arms, kind: arms, evaluations: [few, more]}", "{name: t, kind: arms, evaluations: [one]}"), "few"),
     ],
 )
 def test_evaluations_of_one_cell_have_no_place_there(tmp_path, broken, words):
