@@ -1,15 +1,16 @@
 """What more arms cost: one decision in numpy and one gradient step, by the number of arms, and a model of what lies beyond.
 
-python bench/growth.py policy=pretrained_any json=runs/growth.json
+python bench/growth.py policy=pretrained_any json=bench/results/2026-11-30/growth.json page=docs/concepts/many-arms.md
 
 Cells are random, of N arms each. Times are of the processor, medians; a gradient step draws its batch and is not compiled. The model is
 ``a + b N + c N^2`` with no negative coefficient, the least squares of relative errors over all N that were measured: the same without the
-two largest N tells how far such a model may be trusted one and two steps on.
+two largest N tells how far such a model may be trusted one and two steps on. ``page`` is a page between whose marks the result is written.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import sys
 import tempfile
 import time
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import commit, machine, parse, table
+from common import commit, machine, parse
 from scipy.optimize import nnls
 
 from marl_handover import policies
@@ -32,6 +33,9 @@ from marl_handover.policies import SupervisorPolicy
 
 BEYOND = (16, 32)
 """Numbers of arms that no cell may have, for the model."""
+
+COSTS = {"decision_ms": "one decision", "gradient_step_ms": "one gradient step"}
+BEGIN, END = "<!-- growth:begin -->\n", "<!-- growth:end -->\n"
 
 WARM = 3
 
@@ -98,7 +102,7 @@ def measured(policy: SupervisorPolicy, decisions: int, steps: int) -> dict[str, 
 def models(rows: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, Any]]:
     """Of each cost: the model, what it says of more arms, and how far off it is for the two largest N if it does not know them."""
     arms, told = [int(key) for key in rows], {}
-    for name in ("decision_ms", "gradient_step_ms"):
+    for name in COSTS:
         costs = [row[name] for row in rows.values()]
         fitted, blind = growth(arms, costs), growth(arms[:-2], costs[:-2])
         off = [modelled(blind, count) / cost - 1 for count, cost in zip(arms[-2:], costs[-2:], strict=True)]
@@ -111,25 +115,45 @@ def models(rows: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, Any]]
     return told
 
 
+def page_text(content: Mapping[str, Any]) -> str:
+    """What stands between the marks of the page: the measured costs, the model's, and how good the model is."""
+    lines = ["| arms | pairs that share a place | one decision, ms | one gradient step, ms |", "| --- | --- | --- | --- |"]
+    for arms, row in content["arms"].items():
+        lines.append(f"| {arms} | {row['pairs']:.1f} | {row['decision_ms']:.2f} | {row['gradient_step_ms']:.0f} |")
+    told = [content["models"][name] for name in COSTS]
+    for arms in map(str, BEYOND):
+        decision, step = (about["beyond_ms"][arms] for about in told)
+        lines.append(f"| {arms}, by the model | | {decision:.1f} | {step:,.0f} |")
+    lines.append("")
+    for (name, title), about in zip(COSTS.items(), told, strict=True):
+        parts = zip(about["coefficients_ms"], ("", " N", " N²"), strict=True)
+        model = " + ".join(f"{value:.3g}{power}" for value, power in parts if value > 0)
+        blind = " and ".join(f"{100 * error:+.0f} % at {arms}" for arms, error in about["blind_error"].items())
+        unit = name.removesuffix("_ms").replace("_", " ")
+        lines.append(
+            f"{title[0].upper()}{title[1:]} takes {model} ms; the fit is off by {100 * about['worst_fit']:.0f} % "
+            f"at most. Of a {unit}, a fit that does not know the last two is off by {blind}."
+        )
+    load = content["machine"]["load"]
+    lines.append(f"Measured on {content['machine']['cpu']}, one thread, beside other programs (a load of {load:.1f}).")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
-    """Measure, fit, print, store."""
-    values = parse(sys.argv[1:], {"policy": "pretrained_any", "decisions": 200, "steps": 12, "json": ""})
+    """Measure, fit, print, store, write the page."""
+    values = parse(sys.argv[1:], {"policy": "pretrained_any", "decisions": 200, "steps": 12, "json": "", "page": ""})
     try:
         rows = measured(policies.load(values["policy"]), values["decisions"], values["steps"])
     except HandoverError as error:
         sys.exit(str(error))
-    told = models(rows)
-    lines = [[arms, f"{row['pairs']:.1f}", f"{row['decision_ms']:.2f}", f"{row['gradient_step_ms']:.0f}"] for arms, row in rows.items()]
-    beyond = {arms: [told[name]["beyond_ms"][str(arms)] for name in ("decision_ms", "gradient_step_ms")] for arms in BEYOND}
-    lines += [[f"{arms} (model)", "", f"{costs[0]:.1f}", f"{costs[1]:.0f}"] for arms, costs in beyond.items()]
-    print(table(["arms", "pairs", "decision ms", "gradient step ms"], lines))
-    for name, about in told.items():
-        a, b, c = about["coefficients_ms"]
-        blind = ", ".join(f"{100 * error:+.0f} % at {arms}" for arms, error in about["blind_error"].items())
-        print(f"{name}: {a:.3g} + {b:.3g} N + {c:.3g} N^2, off by {100 * about['worst_fit']:.0f} % at most; without the last two: {blind}")
+    content = {"commit": commit(), "machine": machine(1), "arms": rows, "models": models(rows)}
+    print(page_text(content))
     if values["json"]:
-        content = {"commit": commit(), "machine": machine(1), "arms": rows, "models": told}
         write_whole(Path(values["json"]), json.dumps(content, indent=1) + "\n")
+    if values["page"]:
+        page = Path(values["page"])
+        text = page.read_text(encoding="utf-8")
+        write_whole(page, re.sub(f"{BEGIN}.*?{END}", lambda _: BEGIN + "\n" + page_text(content) + "\n" + END, text, flags=re.DOTALL))
 
 
 if __name__ == "__main__":
