@@ -99,6 +99,11 @@ def build_cell(config: CellConfig) -> CellModel:
     return CellModel(Cell(_arms(names, bases, robots, fits, kinds), config), arms, grid, *each)
 
 
+def build_whole_cell(config: CellConfig) -> CellModel:
+    """As :func:`build_cell`, with the arms that are out of order, too: they stand in the way of the others."""
+    return build_cell(replace(config, enabled=None))
+
+
 class _Kind(NamedTuple):
     """A robot of the cell: settings and kinematics."""
 

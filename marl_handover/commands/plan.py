@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -151,12 +151,11 @@ def _planner(config: PlanConfig, policy: SupervisorPolicy) -> MotionPlanner | No
             raise InvalidSetting(key, value, "left out without motion=FILE or motion_picture=FILE")
         return None
     # The planner is imported here: without motions, this command compiles none of its functions.
-    from marl_handover.cell import build_cell
+    from marl_handover.cell import build_whole_cell
     from marl_handover.motion.planner import MotionPlanner
 
     try:
-        # An arm out of order stands where it stands: the others keep clear of it.
-        return MotionPlanner(build_cell(replace(policy.rules.cell.config, enabled=None)), config.arm_motion)
+        return MotionPlanner(build_whole_cell(policy.rules.cell.config), config.arm_motion)
     except InvalidSetting as error:
         key = f"arm_{error.name}" if error.name.startswith("motion.") else error.name
         raise InvalidSetting(key, error.value, error.limit) from error

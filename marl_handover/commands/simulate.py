@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from marl_handover import policies
 from marl_handover.arrays import Floats, wrap
-from marl_handover.cell import build_cell
+from marl_handover.cell import build_whole_cell
 from marl_handover.config import (
     CELL_ALIASES,
     ENGINES,
@@ -91,7 +91,7 @@ def run(config: SimulateCommand) -> int:
             policy.rules.cell.require_reached(name, pose)
     if config.video and config.captions:
         policy.rules.cell.require_pair("a video's words below the picture, captions=true,")
-    model = build_cell(policy.rules.cell.config)
+    model = build_whole_cell(policy.rules.cell.config)
     camera = view(config.view, model.cell)
     backend = PhysicsBackend(model, config.motion, engine=config.engine, grasp=config.grasp, gui=config.gui, camera=camera, size=size)
     for note in backend.notes:
@@ -146,7 +146,8 @@ def _episodes(
     from marl_handover.envs.handover_aec import raw_env
     from marl_handover.motion.executor import ExecutorAgent
 
-    env = raw_env(backend=backend, cell=model, task=policy.rules.config, motion=config.motion)
+    enabled = policy.rules.cell.config.enabled
+    env = raw_env(backend=backend, cell=model, task=policy.rules.config, motion=config.motion, enabled=enabled)
     supervisor = policy.under(env.rules)
     arms = {agent: ExecutorAgent(agent, model, motion=config.motion) for agent in env.arm_agents}
     problem = {}
@@ -186,8 +187,8 @@ def play(
         if agent == "supervisor":
             try:
                 env.step(supervisor(observation))
-            except NobodyMoves:
-                say("  no arm is to move any more")
+            except NobodyMoves as stop:
+                say(f"  {stop.why or 'no arm is to move any more'}")
                 stopped = True
                 break
             continue

@@ -14,7 +14,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 
 from marl_handover.arrays import Floats
-from marl_handover.cell import NO_ARM, build_cell
+from marl_handover.cell import NO_ARM, build_whole_cell
 from marl_handover.config import LoopConfig, MotionConfig
 from marl_handover.control.outage import Outage, policy_without
 from marl_handover.control.transfers import (
@@ -355,7 +355,7 @@ def make_loop(
     motion, settings = motion or MotionConfig(), settings or LoopConfig()
     settings.validate(policy.rules.config.max_steps)
     enabled = policy.rules.cell.config.enabled
-    model = build_cell(replace(policy.rules.cell.config, enabled=None))
+    model = build_whole_cell(policy.rules.cell.config)
     planner = MotionPlanner(model, motion)
     planner.warm_up()
     made = make_backend(backend, model, policy.rules.config, motion, **options)

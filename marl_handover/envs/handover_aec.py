@@ -7,7 +7,7 @@ that cannot be is refused with a named reason, which the supervisor finds in its
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from pettingzoo import AECEnv
 from pettingzoo.utils import wrappers
 
 from marl_handover.arrays import Floats
-from marl_handover.cell import CellModel, build_cell, cell_config
+from marl_handover.cell import CellModel, build_whole_cell, cell_config
 from marl_handover.config import CellConfig, LoopConfig, MotionConfig, NoiseConfig, TaskConfig, require_between, require_choice
 from marl_handover.envs.backends import Backend, Correctable, KinematicBackend, make_backend
 from marl_handover.envs.cycle_check import FAILURES, CycleCheck, Refusal
@@ -78,6 +78,7 @@ class HandoverEnv(AECEnv):
     Args:
         backend: ``kinematic``, ``noisy``, ``bullet``, ``mujoco``, or one of your own.
         cell: a shipped cell's name, a YAML path, settings, or a cell that is built already.
+        enabled: names of the arms that are in order, if settings do not say so; the others stand still. Arms are counted without them.
         task: the task's settings. Its noise is that of the ``noisy`` backend; the others have their own or none.
         motion: how the arms move.
         architecture: ``"A"`` or ``"B"``; replaces the task's.
@@ -99,6 +100,7 @@ class HandoverEnv(AECEnv):
         render_mode: str | None = None,
         refused_reward: float = -10.0,
         backend_options: Mapping[str, Any] | None = None,
+        enabled: Sequence[str] | None = None,
     ) -> None:
         super().__init__()
         if render_mode is not None:
@@ -107,19 +109,23 @@ class HandoverEnv(AECEnv):
         task, motion = task or TaskConfig(), motion or MotionConfig()
         task = task if architecture is None else replace(task, architecture=architecture)
         self.render_mode, self.refused_reward = render_mode, refused_reward
-        self.model = cell if isinstance(cell, CellModel) else build_cell(cell_config(cell) if isinstance(cell, str) else cell)
-        self.arm_agents = arm_agents(self.model.cell)
+        config = cell.cell.config if isinstance(cell, CellModel) else cell_config(cell) if isinstance(cell, str) else cell
+        self.model = cell if isinstance(cell, CellModel) else build_whole_cell(config)
+        enabled = config.enabled if enabled is None else enabled
         if isinstance(backend, str):
             backend = make_backend(backend, self.model, task, motion, **(backend_options or {}))
         self.backend = backend
-        cost = motion_cost(self.model.cell, task, motion)
         # On arms that are not exact, hand-overs keep to the part of the chart that the closed loop keeps to.
         own = self.model.cell.config.chart_inset
         played = self.model.cell.with_inset(own if self.backend.exact else min(own, LoopConfig().chart_inset))
+        played = played if enabled is None else played.with_arms(enabled)
+        cost = motion_cost(played, task, motion)
+        self.arm_agents = arm_agents(played)
+        self._number = self.model.cell.numbered(range(played.num_arms), played)
         self.rules = Rules(played, replace(task, noise=NoiseConfig()), cost, physical=not self.backend.exact)
         self.check = CycleCheck(self.model, motion)
         self.problems = ProblemSource(played)
-        self.spaces = Spaces(self.model, motion)
+        self.spaces = Spaces(self.model, motion, played)
         self.possible_agents = list(self.spaces.action)
         self.agents: list[str] = []
         self._random: np.random.Generator | None = None
@@ -165,7 +171,7 @@ class HandoverEnv(AECEnv):
         arm = self.arm_agents.index(agent)
         turn = self._turn if self._turn is not None and self._turn.arm == arm else None
         target_mm, final = (self._pose[:2], False) if turn is None else (turn.target_mm, turn.final)
-        return self.spaces.arm_sees(arm, turn is not None, target_mm, final, self._pose, self.backend.joints_rad())
+        return self.spaces.arm_sees(int(self._number[arm]), turn is not None, target_mm, final, self._pose, self.backend.joints_rad())
 
     def step(self, action: Any) -> None:
         """The turn of ``agent_selection``."""
@@ -202,7 +208,7 @@ class HandoverEnv(AECEnv):
         if self._early is not None:
             self._ask(self._early)
             return
-        numbers = read_command(action, self.model.cell.num_arms)
+        numbers = read_command(action, self.rules.cell.num_arms)
         if isinstance(numbers, Refusal):
             self._refuse(numbers)
             return
@@ -239,14 +245,15 @@ class HandoverEnv(AECEnv):
         """Why it was refused or failed, the object's pose afterwards, and the length of the path."""
         if not turn.feasible:
             return Refusal.OUT_OF_REACH, self._pose, 0.0
-        paths = read_cycle(action, self.spaces.control_points, self.model.arms[turn.arm])
+        arm = int(self._number[turn.arm])
+        paths = read_cycle(action, self.spaces.control_points, self.model.arms[arm])
         if isinstance(paths, Refusal):
             return paths, self._pose, 0.0
-        joints = self.backend.joints_rad()[turn.arm]
-        refusal = self.check(turn.arm, paths, joints, self._pose[:2], turn.target_mm)
+        joints = self.backend.joints_rad()[arm]
+        refusal = self.check(arm, paths, joints, self._pose[:2], turn.target_mm)
         if refusal is not None:
             return refusal, self._pose, 0.0
-        done = self.backend.execute(turn.arm, paths)
+        done = self.backend.execute(arm, paths)
         if self.backend.exact and done.refusal is None and isinstance(self.backend, Correctable):
             # The grip may end up to a millimetre off; exact hardware does what the rule book says.
             self.backend.put(turn.planned)

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary
 from numpy.typing import NDArray
 
 from marl_handover.arrays import Floats
-from marl_handover.cell import CellModel
+from marl_handover.cell import Cell, CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.envs.cycle_check import Refusal
 from marl_handover.geometry.arm_model import ArmModel
@@ -100,19 +100,24 @@ class Spaces:
     world, mm; the ``object`` (3,); its ``joints`` (5,) and those of the others, ``other_joints``; and whether the transfer is ``final``. It
     acts with ``paths`` (3, N, 5): control points in rad of approach, transfer and retreat; ``grasp`` and ``release``: 0 declines, and then
     ``reason`` says why.
+
+    Args:
+        model: all arms; their joints are seen.
+        motion: how they move.
+        in_order: the cell of those that are in order, who are N, and have agents; all if None.
     """
 
-    def __init__(self, model: CellModel, motion: MotionConfig) -> None:
-        cell = model.cell
+    def __init__(self, model: CellModel, motion: MotionConfig, in_order: Cell | None = None) -> None:
+        cell = in_order or model.cell
         self.num_arms, self.control_points = cell.num_arms, motion.control_points
         self._shares = np.zeros((self.num_arms, self.num_arms), bool)
         for pair in cell.graph.edges:
             self._shares[pair] = self._shares[pair[::-1]] = True
-        self._high = np.array([*(value + EDGE_MM for value in cell.extent_mm), math.pi], np.float32)
+        self._high = np.array([*(value + EDGE_MM for value in model.cell.extent_mm), math.pi], np.float32)
         self._lower = np.stack([arm.lower_rad for arm in model.arms]).astype(np.float32)
         self._upper = np.stack([arm.upper_rad for arm in model.arms]).astype(np.float32)
         self.observation, self.action = {SUPERVISOR: self._supervisor_sees()}, {SUPERVISOR: self._supervisor_acts()}
-        for arm, agent in enumerate(arm_agents(cell)):
+        for arm, agent in zip(model.cell.numbered(range(cell.num_arms), cell).tolist(), arm_agents(cell), strict=True):
             self.observation[agent], self.action[agent] = self._arm_sees(arm), self._arm_acts(arm)
 
     def supervisor_sees(self, rules: Rules, pose: Floats, goal: Floats, previous_arm: Any) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.cell import Cell, CellModel, build_cell, cell_config
+from marl_handover.cell import Cell, CellModel, build_whole_cell, cell_config
 from marl_handover.config import CellConfig, MotionConfig, require_choice
 from marl_handover.errors import HandoverError, InvalidSetting
 from marl_handover.motion.home import parked_poses
@@ -54,7 +54,7 @@ class ExecutorAgent:
         self.agent, self.method, self.motion = agent, method, motion or MotionConfig()
         if self.motion.method != "optimised":  # its splines have another number of control points than the action space
             raise InvalidSetting("motion.method", self.motion.method, "optimised for an agent of the AEC environment")
-        self.model = cell if isinstance(cell, CellModel) else build_cell(cell_config(cell) if isinstance(cell, str) else cell)
+        self.model = cell if isinstance(cell, CellModel) else build_whole_cell(cell_config(cell) if isinstance(cell, str) else cell)
         agents = arm_agents(self.model.cell)
         require_choice("agent", agent, agents)
         self.arm = agents.index(agent)

@@ -27,11 +27,12 @@ SHIELDED = "shielded:"
 
 
 class NobodyMoves(WorkFailed):
-    """A policy was asked for a command, and wants no arm to move."""
+    """A policy was asked for a command, and wants no arm to move. ``why``: what it says about that; may be empty."""
 
-    def __init__(self, policy: str) -> None:
-        self.policy = policy
-        super().__init__(f"policy {policy!r} wants no arm to move; asked the same again it says the same, so it will never move one")
+    def __init__(self, policy: str, why: str = "") -> None:
+        self.policy, self.why = policy, why
+        reason = why or "asked the same again it says the same, so it will never move one"
+        super().__init__(f"policy {policy!r} wants no arm to move; {reason}")
 
 
 class SupervisorPolicy(ABC):
@@ -189,6 +190,13 @@ class ResigningPolicy(SupervisorPolicy):
         """The policy's decision, or that no arm is to move."""
         solvable = self.planner.plan(pose, goal).transfers > 0
         return np.where(solvable[..., None], self.inner.act(pose, goal, previous_arm), np.nan)
+
+    def __call__(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        """As of any policy; :class:`NobodyMoves` says why."""
+        why = self.unsolvable_because(np.asarray(observation["state"], float), np.asarray(observation["goal"], float))
+        if why:
+            raise NobodyMoves(self.name, why)
+        return super().__call__(observation)
 
     def unsolvable_because(self, pose: Floats, goal: Floats) -> str:
         """Why the goal (3,) cannot be reached from ``pose`` (3,) any more; empty if it can."""

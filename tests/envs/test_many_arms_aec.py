@@ -21,7 +21,8 @@ from marl_handover.envs import SupervisorEnv, handover_aec
 from marl_handover.envs.flat_aec import FlatAEC
 from marl_handover.errors import UnknownChoice
 from marl_handover.motion.executor import ExecutorAgent, arm_agents
-from marl_handover.policies import load
+from marl_handover.policies import ResigningPolicy, load
+from marl_handover.policies.policy import NobodyMoves
 from marl_handover.task.actions import action_of, choices_of
 from marl_handover.task.rules import Outcome, Rules
 from tests.layouts import line, model_of, ring
@@ -223,3 +224,36 @@ def test_the_exact_policy_plays_it_through_the_public_calls(count, layout, archi
             action = policy(observation) if agent == SUPERVISOR else executors[agent].act(observation)
             assert env.action_space(agent).contains({key: np.asarray(value) for key, value in action.items()})
             env.step(action)
+
+
+@pytest.mark.parametrize("names", [["a0", "a2"], ["a2", "a3"], ["a1"], ["a1", "a2", "a3"]])
+def test_arms_out_of_order_have_no_agent_and_stand_in_the_way(names):
+    """Agents, legal commands and transfers are those of the others; joints are of all."""
+    model = model_of(4)
+    env = handover_aec.raw_env(cell=model, enabled=names)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # as above
+        api_test(handover_aec.env(cell=model, enabled=names), num_cycles=60)
+    assert env.possible_agents == [SUPERVISOR, *(f"arm_{name}" for name in names)]
+    supervisor, arms = ResigningPolicy(load("exact", env.rules.cell)), executors_of(model)
+    outcomes, resigned = [], []
+    for seed in range(12):
+        env.reset(seed=seed)
+        home, can_finish = env.backend.joints_rad(), bool(env.rules.can_finish(env._pose, env._goal).any())
+        while env.agents and not (env.terminations[SUPERVISOR] or env.truncations[SUPERVISOR]):
+            agent = env.agent_selection
+            seen = env.observe(agent)
+            assert env.observation_space(agent).contains(seen)
+            try:
+                env.step(supervisor(seen) if agent == SUPERVISOR else arms[agent].act(seen))
+            except NobodyMoves as stop:
+                resigned.append((stop.why, can_finish))
+                break
+        else:
+            outcomes.append(env.infos[SUPERVISOR]["outcome"])
+        still = [name not in names for name in model.cell.names]
+        np.testing.assert_array_equal(env.backend.joints_rad()[still], home[still])
+    assert set(outcomes) <= {"success"}
+    assert bool(outcomes) == bool(env.rules.cell.graph.edges)
+    assert all("the goal cannot be reached any more, with" in why and not could for why, could in resigned)
+    assert len(outcomes) + len(resigned) == 12
