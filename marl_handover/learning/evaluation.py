@@ -28,8 +28,8 @@ EVALUATION_SEED = 1_000_000_000
 """Problems of reports come from seeds from here on; training and its validation use others, so these are never seen."""
 
 TIMED_DECISIONS = 1000
-TIMED_CELLS = 50
-"""Of a batch of cells, so many are timed in at most."""
+TIMED_CELLS, TIMED_IN_EACH = 10, 20
+"""Of a batch of cells, so many are timed in at most, and so many decisions in each."""
 
 CHUNK = 1000
 
@@ -200,8 +200,7 @@ def evaluate_in_cells(
         parts.append(play(posed.rules.of_rows(rows), lambda rules: seeing(under(rules)), start, goal, noise=noise))
         progress(len(start))
     cells = list(islice(posed.layouts(), TIMED_CELLS))
-    timings = math.ceil(TIMED_DECISIONS / len(cells))
-    times = [decision_times_us(under(rules), (posed.start[rows], posed.goal[rows]), timings) for rules, rows in cells]
+    times = [decision_times_us(under(rules), (posed.start[rows], posed.goal[rows]), TIMED_IN_EACH) for rules, rows in cells]
     return Evaluation(_in_a_row(parts), posed.optimal, np.concatenate(times), time.perf_counter() - started)
 
 
