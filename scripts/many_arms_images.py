@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -17,10 +18,15 @@ from matplotlib.patches import Circle
 from marl_handover.cell import Cell, layout_cell
 from marl_handover.commands.plan import solve
 from marl_handover.config import CellConfig, TaskConfig
+from marl_handover.files import package_path
+from marl_handover.learning.graph_network import HandoverGraphs, embedded, hand_over_value
 from marl_handover.policies import ExactPolicy
+from marl_handover.policies.files import read_policy
+from marl_handover.policies.graph_policy import GraphPolicy
 from marl_handover.report.figure_style import BLUE, FAINT, GREY, INK, PAPER, RED, SHARED, arm_colour
 from marl_handover.report.plan import plan_figure
 from marl_handover.report.table import bare, draw_bases, draw_obstacles
+from marl_handover.task.observations import observe
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Rules
@@ -315,6 +321,45 @@ def ring_sizes() -> Figure:
     return figure
 
 
+def learned_values() -> Figure:
+    """The learned value of each arm that carries the block, over the angle, above the fewest transfers from there."""
+    cell = layout_cell(ring(3))
+    rules = Rules(cell, TaskConfig(epsilon_deg=5.0))
+    arrays = read_policy(package_path("pretrained/any.npz"))
+    policy = GraphPolicy(rules, "any", arrays, json.loads(str(arrays["about"])))
+    angles = np.linspace(-math.pi, math.pi, 721)
+    goal = np.array([*GOAL_DEG[:2], math.radians(GOAL_DEG[2])])
+    goals = np.broadcast_to(goal, (len(angles), 3))
+    graph = HandoverGraphs(observe(rules, "graph", goals, goals, np.full(len(angles), -1)).astype(np.float32), 3)
+    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
+    panels = figure.subplots(2, 3, sharex=True, sharey="row")
+    places = sample_problems(cell, 1000, torch.Generator().manual_seed(0))[0].numpy()[:, :2]
+    only = cell.reaches(places) & (cell.reaches(places).sum(-1, keepdims=True) == 1)  # where one arm has the block to itself
+    for arm in range(3):
+        rows = np.flatnonzero(graph.arm == arm)
+        here = np.array([places[np.argmax(only[:, arm])]] * len(angles))
+        yaw = cell.polar(here)[1][:, arm]
+        starts = np.column_stack([here, angles + goal[2] + yaw])
+        learned = 0.0
+        for view, sign in ((graph, 1.0), (graph.mirrored(), -1.0)):
+            known = embedded(policy.layers, policy.shape, view)
+            at = (sign * angles).astype(np.float32)
+            learned = learned + hand_over_value(policy.layers, policy.shape, view, known, rows, at).min(0) / 2
+        needed = planner_of(cell).plan(starts, goals).transfers
+        above, below = panels[:, arm]
+        above.plot(np.degrees(angles), learned, color=arm_colour(arm), linewidth=1.6)
+        below.step(np.degrees(angles), needed, color=INK, linewidth=1.6, where="mid")
+        above.set_title(f"{cell.names[arm]} has the block", fontsize=10)
+        below.set(xlabel="angle u at which it carries it [deg]", xlim=(-180, 180), xticks=range(-180, 181, 90))
+        for axes in (above, below):
+            axes.grid(color=FAINT, linewidth=0.6)
+            for side in ("top", "right"):
+                axes.spines[side].set_visible(False)
+    panels[0, 0].set_ylabel("learned value")
+    panels[1, 0].set(ylabel="fewest transfers left\n(exact planner)", ylim=(4.5, 0.5), yticks=range(1, 5))
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "hand_over_angle": hand_over_angle,
     "offered_angles": offered_angles,
@@ -323,4 +368,5 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "example_two_arms": lambda: example(2),
     "example_three_arms": lambda: example(3),
     "ring_sizes": ring_sizes,
+    "learned_values": learned_values,
 }
