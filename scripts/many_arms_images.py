@@ -331,6 +331,8 @@ def learned_values() -> Figure:
     goal = np.array([*GOAL_DEG[:2], math.radians(GOAL_DEG[2])])
     goals = np.broadcast_to(goal, (len(angles), 3))
     graph = HandoverGraphs(observe(rules, "graph", goals, goals, np.full(len(angles), -1)).astype(np.float32), 3)
+    mirrored = graph.with_mirror()
+    known = embedded(policy.layers, policy.shape, mirrored)
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True, sharey="row")
     places = sample_problems(cell, 1000, torch.Generator().manual_seed(0))[0].numpy()[:, :2]
@@ -340,11 +342,9 @@ def learned_values() -> Figure:
         here = np.array([places[np.argmax(only[:, arm])]] * len(angles))
         yaw = cell.polar(here)[1][:, arm]
         starts = np.column_stack([here, angles + goal[2] + yaw])
-        learned = 0.0
-        for view, sign in ((graph, 1.0), (graph.mirrored(), -1.0)):
-            known = embedded(policy.layers, policy.shape, view)
-            at = (sign * angles).astype(np.float32)
-            learned = learned + hand_over_value(policy.layers, policy.shape, view, known, rows, at).min(0) / 2
+        images = np.concatenate([rows, rows + len(graph.arm)])  # the mirrored problems come after all others
+        both = hand_over_value(policy.layers, policy.shape, mirrored, known, images, np.concatenate([angles, -angles]).astype(np.float32))
+        learned = both.min(0).reshape(2, -1).mean(0)
         needed = planner_of(cell).plan(starts, goals).transfers
         above, below = panels[:, arm]
         above.plot(np.degrees(angles), learned, color=arm_colour(arm), linewidth=1.6)
