@@ -15,6 +15,9 @@ from marl_handover.errors import InvalidSetting, MissingExtra, WorkFailed
 PROBE_S = 5.0
 """How long to wait for an answer at an address. Ray itself would try for two minutes and then end the process."""
 
+WORKER_NICENESS = "RAY_worker_niceness"
+"""Ray's own setting, as an environment variable."""
+
 
 class ClusterUnavailable(WorkFailed):
     """No Ray cluster can be used at an address. ``absent``: nothing answers there, so that starting one may help."""
@@ -56,6 +59,9 @@ def connected(ray: Any, address: str, cores: int, name: str = "address") -> Iter
     address = address or "auto"
     target = os.environ.get("RAY_ADDRESS", address) if address == "auto" else address
     options: dict[str, Any] = {"num_cpus": cores or None, "include_dashboard": False} if target == "local" else {}
+    if target == "local":
+        # Workers of Ray's own choice are at nice 15. On a busy machine they are not there yet when TorchRL stops waiting, after 60 s.
+        os.environ.setdefault(WORKER_NICENESS, "0")
     _probe(target, name)
     try:
         ray.init(address=target, log_to_driver=False, logging_level=logging.ERROR, **options)

@@ -13,13 +13,14 @@ import time
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import cloudpickle
 import pytest
 
 from marl_handover.cli import main
-from marl_handover.cluster import ClusterUnavailable, _root_cause
+from marl_handover.cluster import WORKER_NICENESS, ClusterUnavailable, _root_cause, connected
 from marl_handover.experiments.executor import Failure, fan_out
 
 cluster_utils = pytest.importorskip("ray.cluster_utils", reason="ray is not installed (pip install 'marl_handover[ray]')")
@@ -150,6 +151,28 @@ def test_a_cluster_that_is_not_there_is_one_line():
         with pytest.raises(ClusterUnavailable, match="ray start --head") as error:
             list(fan_out(fails, [0], launcher="ray", address=where, progress=False))
         assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("own", [None, "7"])
+def test_workers_of_a_cluster_that_is_started_here_are_not_behind_all_others(monkeypatch, own):
+    monkeypatch.setenv(WORKER_NICENESS, own or "")
+    if own is None:
+        monkeypatch.delenv(WORKER_NICENESS)
+    seen = []
+
+    def init(**options):
+        seen.append(os.environ[WORKER_NICENESS])
+
+    with connected(SimpleNamespace(is_initialized=lambda: False, init=init, shutdown=lambda: None), "local", 1):
+        assert seen == [own or "0"]
+
+
+@pytest.mark.slow
+def test_a_worker_of_a_cluster_that_is_started_here_runs_as_this_process_does():
+    import ray
+
+    with connected(ray, "local", 1):
+        assert ray.get(ray.remote(lambda: os.nice(0)).remote()) == os.nice(0)
 
 
 def test_what_ray_wraps_in_advice_is_told_by_its_cause():
