@@ -246,3 +246,25 @@ def test_a_stored_shape_is_what_was_stored(width, rounds, components, slack):
 def test_a_shape_that_cannot_be_is_refused(lie):
     with pytest.raises((ValueError, TypeError)):
         stored_shape({**GraphShape()._asdict(), **lie})
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.4])
+def test_hopeless_is_where_no_chain_of_arms_leads_to_one_that_reaches_the_goal(seen, kept):
+    """Followed arm by arm, in graphs that have lost many of their intervals as well."""
+    rules, observation = seen
+    draw, graph = np.random.default_rng(3), HandoverGraphs(observation, rules.cell.num_arms)
+    left = draw.random(len(graph.giver)) < kept
+    graph.giver, graph.receiver = graph.giver[left], graph.receiver[left]
+    graph.reaches_goal = graph.reaches_goal * (draw.random(len(graph.arm)) < max(kept, 0.6))
+    expected = []
+    for problem in range(graph.count):
+        carry = [row for row in np.flatnonzero(graph.problem == problem) if graph.reaches_object[row]]
+        met = set(carry)
+        while carry:
+            row = carry.pop()
+            onward_to = {int(each) for each in graph.receiver[graph.giver == row]} - met
+            met |= onward_to
+            carry += onward_to
+        expected.append(not any(graph.reaches_goal[row] for row in met))
+    np.testing.assert_array_equal(graph.hopeless(), expected)
+    assert (kept == 1.0) is not any(expected)
