@@ -48,7 +48,11 @@ def select(values: Array, index: Array) -> Array:
     if isinstance(values, np.ndarray):
         if values.ndim == 1:
             return values[int(index)]
-        return np.take_along_axis(values, np.asarray(index)[..., None], axis=-1)[..., 0]
+        rows = np.asarray(index).reshape(-1)
+        if np.shape(index) != values.shape[:-1]:
+            return np.take_along_axis(values, np.asarray(index)[..., None], axis=-1)[..., 0]
+        # Much quicker than that where there are few.
+        return values.reshape(-1, values.shape[-1])[np.arange(len(rows)), rows].reshape(values.shape[:-1])
     return values.gather(-1, index.unsqueeze(-1)).squeeze(-1)
 
 

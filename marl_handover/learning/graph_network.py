@@ -33,8 +33,8 @@ LOG_STD_RANGE = (-6.0, 1.0)
 SCORE = 8.0
 """Scores of messages are cut off here."""
 
-FAR = 9.0
-"""An angle in rad that is larger than any."""
+TINY = 1e-6
+"""Intervals are not narrower than this, in rad, where something is divided by their half width."""
 
 
 class GraphShape(NamedTuple):
@@ -159,7 +159,7 @@ def embedded(layers: Layers, shape: GraphShape, graph: HandoverGraphs) -> Array:
     for _ in range(shape.rounds):
         told = xp.concat([known[graph.giver], _turned_back(known[graph.receiver], turn), fixed], -1)
         message = layers["message_out"](_positive(layers["message"](told)))
-        weight = xp.exp(xp.clip(message[:, -1:], -SCORE, SCORE))
+        weight = xp.exp(_clipped(message[:, -1:], -SCORE, SCORE))
         total = graph.summed(weight) + 1e-6
         heard = graph.summed(weight * _positive(message[:, :-1])) / total
         update = layers["revise"](xp.concat([known, heard, xp.log(total) / 4], -1))
@@ -178,10 +178,10 @@ def arm_facts(graph: HandoverGraphs, arm: Array, angle: Array, slack: bool = Tru
     away = onward(graph, arm, angle)[0] if slack else 0 * angle
     facts = [
         reach,
-        reach * (1 + xp.clip(MARGIN_SLOPE * (1 - abs(error) / epsilon), -1, 1)) - 1,
-        reach * xp.clip(error / epsilon / 4, -1, 1),
+        reach * (1 + _clipped(MARGIN_SLOPE * (1 - abs(error) / epsilon), -1, 1)) - 1,
+        reach * _clipped(error / epsilon / 4, -1, 1),
         away / math.pi,
-        xp.clip(away / epsilon / 4, -1, 1),
+        _clipped(away / epsilon / 4, -1, 1),
         xp.log(epsilon),
     ]
     return xp.concat([xp.stack(facts, -1), reach[..., None] * _harmonics(error, 3)], -1)
@@ -200,7 +200,7 @@ def onward(graph: HandoverGraphs, arm: Array, angle: Array) -> tuple[Array, Arra
     slack = xp.where(offers, graph.half[edge] - abs(missing), 0 * missing - math.pi)
     best = xp.argmax(slack, -1)
     slack, missing = select(slack, best), select(missing, best)
-    return slack, xp.sign(missing) * xp.clip(-slack, 0, None) * (slack > -math.pi)
+    return slack, xp.sign(missing) * _positive(-slack) * (slack > -math.pi)
 
 
 def hand_over_value(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known: Array, arm: Array, angle: Array) -> Array:
@@ -218,7 +218,7 @@ def hand_over_value(layers: Layers, shape: GraphShape, graph: HandoverGraphs, kn
 def finish_value(layers: Layers, facts: Array) -> Array:
     """Value (...) of finishing with arms of which :func:`arm_facts` says ``facts`` (..., :data:`FACTS`)."""
     xp = namespace(facts)
-    steep = xp.clip(FINISH_SLOPE / MARGIN_SLOPE * facts[..., 1:2], -1, 1)
+    steep = _clipped(FINISH_SLOPE / MARGIN_SLOPE * facts[..., 1:2], -1, 1)
     hidden = _positive(layers["finish"](xp.concat([facts, steep], -1)))
     value: Array = layers["finish_out"](_positive(layers["finish_hidden"](hidden)))[..., 0]
     return value
@@ -237,7 +237,7 @@ def best_places(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known:
     reach, missing = graph.reaches_goal[graph.receiver], wrap(graph.goal_angle[graph.receiver] - there)
     slack, change = onward(graph, graph.receiver, there) if shape.slack else (0 * there - math.pi, 0 * there)
     width = half + 0.05
-    own = [half, reach * xp.clip(missing / width, -2, 2), xp.clip(change / width, -2, 2), (slack > -math.pi) + 0 * half, xp.log(width)]
+    own = [half, reach * _clipped(missing / width, -2, 2), _clipped(change / width, -2, 2), (slack > -math.pi) + 0 * half, xp.log(width)]
     parts = [
         _turned_back(known[graph.giver], _harmonics(angle)),
         _turned_back(known[graph.receiver], turn),
@@ -248,9 +248,10 @@ def best_places(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known:
     ]
     hidden = _positive(layers["place_hidden"](_positive(layers["place"](xp.concat(parts, -1)))))
     out = layers["place_out"](hidden)
-    starts = [_before_tanh(reach * missing / half), *([_before_tanh(change / half)] if shape.slack else [])]
+    some = _positive(half - TINY) + TINY
+    starts = [_before_tanh(reach * missing / some), *([_before_tanh(change / some)] if shape.slack else [])]
     starts = starts[: shape.components] + [0 * half] * (shape.components - len(starts))
-    return out[:, : shape.components] + xp.stack(starts, -1), xp.clip(out[:, shape.components :], *LOG_STD_RANGE)
+    return out[:, : shape.components] + xp.stack(starts, -1), _clipped(out[:, shape.components :], *LOG_STD_RANGE)
 
 
 def arrival(graph: HandoverGraphs, angle: Array, place: Array, edge: Array) -> Array:
@@ -331,7 +332,7 @@ def chosen(graph: HandoverGraphs, value: Array, place: Array, finish: Array, mos
 
 def _before_tanh(place: Array) -> Array:
     xp = namespace(place)
-    return xp.arctanh(xp.clip(place, -0.995, 0.995))
+    return xp.arctanh(_clipped(place, -0.995, 0.995))
 
 
 def _harmonics(angle: Array, count: int = HARMONICS) -> Array:
@@ -358,8 +359,13 @@ def _normalised(x: Array) -> Array:
     xp = namespace(x)
     if xp is not np:
         return xp.nn.functional.layer_norm(x, (x.shape[-1],))
-    x = x - x.mean(-1, keepdims=True)
-    return x / np.sqrt((x * x).mean(-1, keepdims=True) + np.float32(1e-5))
+    count = np.float32(x.shape[-1])
+    x = x - np.add.reduce(x, -1, keepdims=True) / count
+    return x / np.sqrt(np.add.reduce(x * x, -1, keepdims=True) / count + np.float32(1e-5))
+
+
+def _clipped(x: Array, low: float, high: float) -> Array:
+    return np.minimum(np.maximum(x, low), high) if isinstance(x, np.ndarray) else x.clip(low, high)  # numpy's own clip is slow
 
 
 def _positive(x: Array) -> Array:
