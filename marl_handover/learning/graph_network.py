@@ -365,11 +365,11 @@ def _normalised(x: Array) -> Array:
 
 
 def _clipped(x: Array, low: float, high: float) -> Array:
-    return np.minimum(np.maximum(x, low), high) if isinstance(x, np.ndarray) else x.clip(low, high)  # numpy's own clip is slow
+    return np.minimum(np.maximum(x, low), high) if namespace(x) is np else x.clip(low, high)  # numpy's own clip is slow
 
 
 def _positive(x: Array) -> Array:
-    return np.maximum(x, 0) if isinstance(x, np.ndarray) else x.relu()
+    return np.maximum(x, 0) if namespace(x) is np else x.relu()
 
 
 def _nonzero(x: Array) -> Any:
