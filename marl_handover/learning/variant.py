@@ -139,7 +139,7 @@ class Variant:
 
         if isinstance(rules.cell, CellBatch):
             return play(rules, lambda rows: self.policy(algorithm, rows), start, goal)
-        act = self.policy(algorithm, rules)
+        act = self.policy(algorithm)
 
         def mistaken(pose: Tensor, goal: Tensor, previous: Tensor) -> Tensor:
             offset = offsets(len(pose), settings.observed_mm, settings.observed_deg)
