@@ -193,7 +193,7 @@ def test_worker_processes_know_them_too(write):
 
 def test_a_name_without_its_plugin_is_unknown(write, capsys):
     assert main(["train", "algorithm=bolder"]) == 2
-    assert "choose one of: sac, flat_sac, td3, ppo, dqn" in capsys.readouterr().err
+    assert "choose one of: sac, graph_sac, flat_sac, td3, ppo, dqn" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

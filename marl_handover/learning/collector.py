@@ -16,6 +16,7 @@ from marl_handover.cell.batch import LayoutPool, random_layouts
 from marl_handover.config import LayoutConfig
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.replay import EpisodeWriter
+from marl_handover.parsing import parse_object
 from marl_handover.progress import working
 from marl_handover.task.rules import Outcome
 
@@ -87,7 +88,7 @@ class LayoutStream:
         """Inverse of :meth:`state_dict`, for a pool that still has its first layouts only."""
         self.pool.extend([(arms.numpy(), discs.numpy()) for arms, discs in state["layouts"][len(self.pool) :]])
         self.since = state["since"]
-        self.generator.bit_generator.state = json.loads(state["random"])
+        self.generator.bit_generator.state = parse_object(state["random"])
 
 
 class BatchedCollector(Collector):

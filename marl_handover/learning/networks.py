@@ -116,7 +116,8 @@ def squashed(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tens
     raw = mean + log_std.exp() * noise
     log_prob = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
     # log(1 - tanh(x)^2), stable at saturation
-    return raw.tanh(), log_prob - 2 * (math.log(2) - raw - F.softplus(-2 * raw))
+    log_prob = log_prob - 2 * (math.log(2) - raw - F.softplus(-2 * raw))
+    return raw.tanh(), log_prob  # in this order: gradients are summed in the order of what they come through
 
 
 def squashed_sample(branches: ActionDistribution, noise: Tensor) -> tuple[Tensor, Tensor]:

@@ -144,7 +144,7 @@ class SacConfig(OffPolicyConfig):
     canonical: bool = True  # fold the mirror symmetry M_x into the networks
     harmonics: int = bounded(2, 0, 16)  # doublings of the angles that the networks see
     candidates: int = bounded(3, 0, 256)  # places an arm tried anywhere, and as many nearby; the actor is drawn to the nearest better one
-    candidate_share: float = bounded(1.0, 0.0, 1.0)  # of the batch
+    candidate_share: float = bounded(0.5, 0.0, 1.0)  # of the batch
     candidate_weight: float = bounded(1.0, 0.0, 1e6)
     candidate_margin: float = bounded(0.25, -1e6, 1e6)  # in units of scaled reward
     deterministic_env_fraction: float = bounded(0.25, 0.0, 1.0)  # of the cells, which act without noise

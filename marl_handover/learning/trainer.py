@@ -82,7 +82,7 @@ class Trainer:
         config = self.config
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
         if not isinstance(config.algorithm, GraphSacConfig):
-            load_cell(config.cell).require_pair(f"training with algorithm={config.algorithm.name}")
+            load_cell(config.cell).require_pair("training")
         self.variant = make_variant(config.variant)
         self.env = self.variant.env(config, self.device)
         self.rules = self.env.rules
