@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -16,7 +15,6 @@ from marl_handover.cell.batch import LayoutPool, random_layouts
 from marl_handover.config import LayoutConfig
 from marl_handover.envs.supervisor_env import SupervisorEnv
 from marl_handover.learning.replay import EpisodeWriter
-from marl_handover.parsing import parse_object
 from marl_handover.progress import working
 from marl_handover.task.rules import Outcome
 
@@ -82,13 +80,13 @@ class LayoutStream:
     def state_dict(self) -> dict[str, Any]:
         """Plain tensors, numbers and text."""
         layouts = [[torch.from_numpy(arms), torch.from_numpy(discs)] for arms, discs in self.pool.layouts]
-        return {"layouts": layouts, "since": self.since, "random": json.dumps(self.generator.bit_generator.state)}
+        return {"layouts": layouts, "since": self.since, "random": dict(self.generator.bit_generator.state)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`, for a pool that still has its first layouts only."""
         self.pool.extend([(arms.numpy(), discs.numpy()) for arms, discs in state["layouts"][len(self.pool) :]])
         self.since = state["since"]
-        self.generator.bit_generator.state = parse_object(state["random"])
+        self.generator.bit_generator.state = state["random"]
 
 
 class BatchedCollector(Collector):
