@@ -8,13 +8,13 @@ is a tanh-Gaussian, one network for all. Hindsight gives the states their goals 
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from marl_handover.arrays import wrap
 from marl_handover.cell.sectors import chart_alpha
 from marl_handover.learning.algorithm import Algorithm, register_algorithm, stepped
 from marl_handover.learning.graph_network import (
@@ -138,7 +138,7 @@ class GraphSac(Algorithm):
         place = torch.where(
             self._uniform(sampled.place.shape) < self.config.random_place, self._anywhere(sampled.place.shape), sampled.place
         )
-        value = self._value(self.network.layers, graph, known, graph.angle, place)
+        value = self._value(self.network.layers, graph, known, place)
         finish = finish_value(self.network.layers, facts)
         noise = self._gumbel(value.shape), self._gumbel(finish.shape)
         # Some cells follow the likeliest branch: where that goes in circles, its states must get into the memory.
@@ -182,7 +182,7 @@ class GraphSac(Algorithm):
         """What handing over to each arm is worth by what it can do next, (A,), and the share (E, components) of each branch of it."""
         own, scale = self.config, self.config.reward_scale
         known = embedded(self.average.layers, self.shape, graph)
-        value = self._value(self.average.layers, graph, known, graph.angle, sampled.place)
+        value = self._value(self.average.layers, graph, known, sampled.place)
         value = value - own.place_temperature * sampled.log_prob.clamp(-3.0, 6.0)
         finish = finish_value(self.average.layers, facts)
         best = value.new_full(finish.shape, -torch.inf).scatter_reduce(0, graph.giver, value.amax(-1), "amax").maximum(finish)
@@ -196,8 +196,7 @@ class GraphSac(Algorithm):
     def _finish_reward(self, graph: HandoverGraphs) -> Tensor:
         """What the rule book gives (A,) for finishing with each arm now."""
         reward = self.rules.config.reward
-        error = torch.remainder(graph.angle - graph.goal_angle + math.pi, 2 * math.pi) - math.pi
-        there = (graph.reaches_goal > 0) & (error.abs() <= graph.epsilon)
+        there = (graph.reaches_goal > 0) & (wrap(graph.angle - graph.goal_angle).abs() <= graph.epsilon)
         return self.config.reward_scale * torch.where(there, reward.success, reward.failure)
 
     def _actor_loss(self, graph: HandoverGraphs, known: Tensor, sampled: Sampled, share: Tensor) -> Tensor:
@@ -205,7 +204,7 @@ class GraphSac(Algorithm):
         own = self.config
         for parameter in self.network.parts(of_actor=False):
             parameter.requires_grad_(False)
-        value = self._value(self.network.layers, graph, known, graph.angle, sampled.place)
+        value = self._value(self.network.layers, graph, known, sampled.place)
         loss = ((0.1 + share) * (own.place_temperature * sampled.log_prob - value)).mean()
         some = torch.arange(int(own.candidate_share * len(graph.giver)), device=self.device)
         loss = loss + own.candidate_weight * self._pull(graph, known, sampled.mean[some], some) if len(some) else loss
@@ -223,7 +222,7 @@ class GraphSac(Algorithm):
             component = torch.randint(components, (own.candidates,), generator=self.generator, device=self.device)
             beside = (mean[:, component] + self._nearby((len(edge), own.candidates))).clamp(-1.0, 1.0)
             tried = torch.cat([mean, self._anywhere((len(edge), own.candidates)), beside], -1)
-            worth = self._value(self.network.layers, graph, known, graph.angle, tried, edge)
+            worth = self._value(self.network.layers, graph, known, tried, edge)
             best, taken = worth[:, :components].max(-1, keepdim=True)
             gain = worth[:, components:] - best - own.candidate_margin
         distance = (mean.gather(1, taken) - tried[:, components:]).square()
@@ -238,15 +237,10 @@ class GraphSac(Algorithm):
         place, log_prob = squashed(mean, log_std, self._noise(mean.shape))
         return Sampled(place, log_prob, mean.tanh())
 
-    def _value(
-        self, layers: Layers, graph: HandoverGraphs, known: Tensor, angle: Tensor, place: Tensor, edge: Tensor | None = None
-    ) -> Tensor:
-        """The lower of both critics' values (m, k) of handing over at ``place`` (m, k) in the rows ``edge`` (m,) of intervals, or in all.
-
-        Arms carry the object at ``angle`` (A,).
-        """
+    def _value(self, layers: Layers, graph: HandoverGraphs, known: Tensor, place: Tensor, edge: Tensor | None = None) -> Tensor:
+        """The lower twin values (m, k) of handing over at ``place`` (m, k) in the rows ``edge`` (m,) of intervals, or in all."""
         rows = torch.arange(len(graph.giver), device=self.device) if edge is None else edge
-        there = arrival(graph, angle[graph.giver[rows]], place, rows)
+        there = arrival(graph, graph.angle[graph.giver[rows]], place, rows)
         value: Tensor = hand_over_value(layers, self.shape, graph, known, graph.receiver[rows, None].expand_as(there), there).amin(0)
         return value
 
