@@ -1,7 +1,8 @@
 """Learned supervision of cooperating robot arms: hand-overs that bring an object to a goal pose.
 
-With the package imported, Gymnasium knows ``marl_handover/SupervisorA-v0`` and ``marl_handover/SupervisorB-v0``. Gymnasium itself is not
-imported for that: ``marl-handover stop`` must not wait for it.
+With the package imported, Gymnasium knows ``marl_handover/SupervisorA-v0``, ``marl_handover/SupervisorB-v0`` and an id for each rung of the
+ladder, such as ``marl_handover/Ladder-3-Triangle-v0``. Gymnasium itself is not imported for that: ``marl-handover stop`` must not wait
+for it.
 """
 
 import importlib.util
@@ -19,6 +20,13 @@ def _register(gymnasium: ModuleType) -> None:
             id=f"marl_handover/Supervisor{architecture}-v0",
             entry_point="marl_handover.envs.goal_env:SupervisorGoalEnv",
             kwargs={"architecture": architecture},
+        )
+    from marl_handover.files import resource_path  # here, as Gymnasium
+    from marl_handover.parsing import read_yaml
+
+    for rung in read_yaml(resource_path("configs/ladder/rungs.yaml"), "ladder")["rungs"]:
+        gymnasium.register(
+            id=f"marl_handover/{rung['id']}", entry_point="marl_handover.envs.ladder:gymnasium_env", kwargs={"name": rung["name"]}
         )
 
 

@@ -183,6 +183,16 @@ class CorruptFile(HandoverError):
         self.what, self.path, self.reason = what, Path(path), reason
 
 
+class ChecksumMismatch(HandoverError):
+    """A file whose content is part of what a result means is another one than it should be. ``found``, ``wanted``: its SHA-256."""
+
+    def __init__(self, path: Path | str, found: str, wanted: str) -> None:
+        super().__init__(
+            f"{shortened(str(path), LONGEST_LIST)} was changed: its SHA-256 is {found[:12]}…, not {wanted[:12]}…; install the package again"
+        )
+        self.path, self.found, self.wanted = Path(path), found, wanted
+
+
 class BadLine(HandoverError):
     """A line of a file says what cannot be; ``error`` says why."""
 

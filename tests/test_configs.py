@@ -20,7 +20,7 @@ def named(group):
 
 
 def test_every_file_belongs_to_a_group_that_is_tested_here():
-    assert {path.parent.name for path in CONFIGS.rglob("*.yaml")} == {"cell", "hardware", "preset", "robot", "search", "suite"}
+    assert {path.parent.name for path in CONFIGS.rglob("*.yaml")} == {"cell", "hardware", "ladder", "preset", "robot", "search", "suite"}
     assert "paper" in named("cell")
     assert "smoke" in named("preset")
 

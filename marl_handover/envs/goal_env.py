@@ -41,6 +41,8 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         cell: the cell, or what :func:`marl_handover.cell.load_cell` takes; the shipped ``paper`` cell if None.
         task: the task's settings; the defaults, with layout ``object``, if None.
         render_mode: ``"rgb_array"``: :meth:`render` draws the table from above.
+        problems: where problems of the cell come from; random ones if None. Where their optimum is known, ``info`` carries it, as
+            ``optimum``, and when the episode is over ``regret`` (:func:`marl_handover.task.problems.regret`).
         settings: single settings of the task, such as ``epsilon_deg=1.0``, put over ``task``.
 
     Raises:
@@ -55,6 +57,7 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         cell: Cell | CellConfig | str | None = None,
         task: TaskConfig | None = None,
         render_mode: str | None = None,
+        problems: ProblemSource | None = None,
         **settings: Any,
     ) -> None:
         if render_mode is not None:
@@ -77,7 +80,7 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         self._pose = self._goal = np.zeros(3)
         self._previous = np.int64(-1)
         self._transfers = 0
-        self._problems = ProblemSource(self.rules.cell)
+        self._problems = problems or ProblemSource(self.rules.cell)
 
     _spec: EnvSpec | None = None  # of an environment that was made without gymnasium.make
 
@@ -103,12 +106,14 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         Raises:
             UnknownKey, InvalidSetting, OutOfReach, NotFinite: for options, a state or a goal that cannot be.
         """
+        if seed is None and self._np_random is None:
+            seed = self._problems.seed
         super().reset(seed=seed)
         if seed is not None:
             self._problems.clear()
         self._pose, self._goal = self._problems.next(self.np_random, options)
         self._previous, self._transfers = np.int64(-1), 0
-        return self._observation(), self._info(True, False, Outcome.NONE, 0.0)
+        return self._observation(), self._info(True, False, Outcome.NONE, 0.0, over=False)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Execute one command; see :class:`marl_handover.task.rules.Rules`."""
@@ -122,7 +127,8 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         self._pose, self._previous = result.pose, result.previous_arm
         self._transfers = int(stepped.transfers)
         terminated, truncated = bool(result.terminated), bool(stepped.truncated)
-        info = self._info(bool(result.feasible), bool(result.command.final), Outcome(int(stepped.outcome)), float(penalty))
+        outcome, over = Outcome(int(stepped.outcome)), terminated or truncated
+        info = self._info(bool(result.feasible), bool(result.command.final), outcome, float(penalty), over=over)
         info["room"] = room or (int(result.transfers) == 1 and int(result.external_arm) >= 0)
         return self._observation(), float(result.reward), terminated, truncated, info
 
@@ -182,8 +188,9 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
             "desired_goal": self._goal.astype(np.float32),
         }
 
-    def _info(self, feasible: bool, final: bool, outcome: Outcome, motion_penalty: float) -> dict[str, Any]:
+    def _info(self, feasible: bool, final: bool, outcome: Outcome, motion_penalty: float, *, over: bool) -> dict[str, Any]:
         return {
+            **self._problems.told(outcome, self._transfers, over, self.rules.config.max_steps),
             "motion_penalty": motion_penalty,
             "feasible": feasible,
             "final": final,

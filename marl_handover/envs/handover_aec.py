@@ -85,6 +85,8 @@ class HandoverEnv(AECEnv):
         render_mode: ``"rgb_array"`` or ``"human"``: one line of text a turn.
         refused_reward: an arm's reward for a refused or failed transfer.
         backend_options: for the backend's class, if it is named.
+        problems: where problems of the cell come from; random ones if None. Where their optimum is known, ``infos["supervisor"]`` has
+            ``optimum``, and when the episode is over ``regret`` (:func:`marl_handover.task.problems.regret`).
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "name": "handover_v0", "is_parallelizable": False, "render_fps": 2}  # noqa: RUF012
@@ -101,6 +103,7 @@ class HandoverEnv(AECEnv):
         refused_reward: float = -10.0,
         backend_options: Mapping[str, Any] | None = None,
         enabled: Sequence[str] | None = None,
+        problems: ProblemSource | None = None,
     ) -> None:
         super().__init__()
         if render_mode is not None:
@@ -124,7 +127,7 @@ class HandoverEnv(AECEnv):
         self._number = self.model.cell.numbered(range(played.num_arms), played)
         self.rules = Rules(played, replace(task, noise=NoiseConfig()), cost, physical=not self.backend.exact)
         self.check = CycleCheck(self.model, motion)
-        self.problems = ProblemSource(played)
+        self.problems = problems or ProblemSource(played)
         self.spaces = Spaces(self.model, motion, played)
         self.possible_agents = list(self.spaces.action)
         self.agents: list[str] = []
@@ -145,6 +148,8 @@ class HandoverEnv(AECEnv):
             UnknownKey, InvalidSetting: for another option, or a pose that is not three numbers.
             OutOfReach, NotFinite: for a state or goal that cannot be.
         """
+        if seed is None and self._random is None:
+            seed = self.problems.seed
         if seed is not None or self._random is None:
             self._random, _ = seeding.np_random(seed)
             self.problems.clear()
@@ -299,7 +304,8 @@ class HandoverEnv(AECEnv):
         self._penalty = 0.0
         self.terminations = dict.fromkeys(self.agents, bool(verdict.terminated))
         self.truncations = dict.fromkeys(self.agents, bool(truncated))
-        self.infos[SUPERVISOR] = {"refusal": refusal, "transfers": self._transfers, "outcome": self._outcome.name.lower()}
+        told = self.problems.told(self._outcome, self._transfers, bool(verdict.terminated or truncated), self.rules.config.max_steps)
+        self.infos[SUPERVISOR] = {"refusal": refusal, "transfers": self._transfers, "outcome": self._outcome.name.lower(), **told}
         self.agent_selection = SUPERVISOR
 
 

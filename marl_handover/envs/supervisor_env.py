@@ -16,6 +16,7 @@ from marl_handover.cell.batch import CellBatch, LayoutPool
 from marl_handover.config import TaskConfig, require_at_least, require_positive
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.task.episode import advance
+from marl_handover.task.ladder import RungSource
 from marl_handover.task.observations import observation_size, observe
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Outcome, Rules, carried
@@ -38,6 +39,8 @@ class SupervisorEnv(EnvBase):
         rules: another rule book than that of cell and task.
         layouts: draw each episode's cell from these, instead of one for all; the tensordict then carries its number, ``layout``.
             Layouts that are added to the pool later are drawn instead of as many of the first ones.
+        problems: of a rung of the ladder, whose cell and task are to be given as well, instead of random ones. Cells that are reset get
+            the next ones in order, and the tensordict carries the fewest transfers of each, ``optimum`` (num_envs, 1).
     """
 
     batch_locked = True
@@ -51,6 +54,7 @@ class SupervisorEnv(EnvBase):
         seed: int | None = None,
         rules: Rules | None = None,
         layouts: LayoutPool | None = None,
+        problems: RungSource | None = None,
     ) -> None:
         require_at_least("num_envs", num_envs, 1)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
@@ -61,6 +65,7 @@ class SupervisorEnv(EnvBase):
             self.rules = rules or Rules(cell, task, motion_cost(cell, task))
         else:
             self.rules = rules or Rules(CellBatch(layouts, np.zeros(num_envs, np.int64)), task)
+        self.problems = problems
         self.generator = torch.Generator(device=self.device)
         self.epsilon_range_rad = (self.rules.epsilon_rad, self.rules.epsilon_rad)
         self._make_specs()
@@ -81,8 +86,9 @@ class SupervisorEnv(EnvBase):
             "feasible": Binary(shape=(count, 1), dtype=torch.bool, device=device),
             "outcome": Bounded(0, max(Outcome), shape=(count, 1), dtype=torch.int64, device=device),
         }
-        if self.layouts is not None:
-            problem["layout"] = Unbounded(shape=(count, 1), dtype=torch.int64, device=device)
+        for key, carried_on in (("layout", self.layouts), ("optimum", self.problems)):
+            if carried_on is not None:
+                problem[key] = Unbounded(shape=(count, 1), dtype=torch.int64, device=device)
         self.observation_spec = Composite(problem, shape=self.batch_size, device=device)
         self.action_spec = Bounded(-1.0, 1.0, shape=(count, self.rules.action_size), device=device)
         self.reward_spec = Unbounded(shape=(count, 1), device=device)
@@ -100,6 +106,8 @@ class SupervisorEnv(EnvBase):
             self.generator.seed()
         else:
             self.generator.manual_seed(seed)
+        if self.problems is not None:
+            self.problems.clear()
 
     def draw_epsilon(self, count: int) -> Tensor:
         """``count`` values of epsilon in rad, as new episodes get them."""
@@ -112,14 +120,9 @@ class SupervisorEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = None if mask is None else mask.reshape(-1).nonzero()[:, 0]
         # TorchRL takes only the rows that are reset. Where these are many, drawing for all cells costs less than putting some in place.
-        everyone = rows is None or len(rows) * 4 >= self.batch_size[0]
+        everyone = rows is None or (len(rows) * 4 >= self.batch_size[0] and self.problems is None)
         fresh = self.batch_size[0] if everyone or rows is None else len(rows)
-        rules, layout = self.rules, None
-        if self.layouts is not None:
-            last = len(self.layouts)
-            layout = torch.randint(last - self.drawn_layouts, last, (fresh,), generator=self.generator, device=self.device)
-            rules = self.rules.on(CellBatch(self.layouts, layout.cpu().numpy()))
-        pose, goal = sample_problems(rules.cell, fresh, self.generator, torch.float32)
+        rules, pose, goal, also = self._posed(fresh)
         epsilon = self.draw_epsilon(fresh)
         previous = torch.full((fresh,), -1, device=self.device)
         observation = self.observe(pose, goal, previous, epsilon, rules)
@@ -134,14 +137,29 @@ class SupervisorEnv(EnvBase):
             "placed": pose.clone(),
             "feasible": torch.ones_like(zero, dtype=torch.bool),
             "outcome": zero,
+            **also,
         }
-        if layout is not None:
-            new["layout"] = layout[:, None]
         if rows is not None and not everyone:
             for key, value in new.items():
                 new[key] = value.new_zeros(self.batch_size + value.shape[1:])
                 new[key][rows] = value
         return TensorDict(new, self.batch_size, device=self.device)
+
+    def _posed(self, count: int) -> tuple[Rules, Tensor, Tensor, dict[str, Tensor]]:
+        """Rules of ``count`` new episodes, starts and goals (count, 3), and what the tensordict carries besides, each (count, 1)."""
+        if self.problems is not None:
+            posed = self.problems.take(count, self._draw_seed)
+            pose, goal = (torch.as_tensor(poses, dtype=torch.float32, device=self.device) for poses in (posed.start, posed.goal))
+            return self.rules, pose, goal, {"optimum": torch.as_tensor(posed.optimum, device=self.device)[:, None]}
+        rules, also = self.rules, {}
+        if self.layouts is not None:
+            last = len(self.layouts)
+            layout = torch.randint(last - self.drawn_layouts, last, (count,), generator=self.generator, device=self.device)
+            rules, also = self.rules.on(CellBatch(self.layouts, layout.cpu().numpy())), {"layout": layout[:, None]}
+        return rules, *sample_problems(rules.cell, count, self.generator, torch.float32), also
+
+    def _draw_seed(self) -> int:
+        return int(torch.randint(2**31 - 1, (), generator=self.generator, device=self.device))
 
     def _noise(self) -> Tensor | None:
         if not self.rules.noisy:
@@ -179,7 +197,7 @@ class SupervisorEnv(EnvBase):
         stepped = advance(rules, pose, goal, previous, action, made, epsilon_rad=epsilon, noise=noise, final_noise=final_noise)
         result, terminated, truncated = stepped.result, stepped.result.terminated[:, None], stepped.truncated[:, None]
         observation = self.observe(result.pose, goal, result.previous_arm, epsilon, rules)
-        kept = {} if self.layouts is None else {"layout": tensordict["layout"]}
+        kept = {key: tensordict[key] for key in ("layout", "optimum") if key in self.observation_spec.keys()}  # noqa: SIM118  # no mapping
         return TensorDict(
             kept
             | {

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from marl_handover.arrays import Floats, wrap
+from marl_handover.arrays import Array, Floats, namespace, wrap
 from marl_handover.cell.batch import CellBatch
 from marl_handover.cell.cell import Cell
 from marl_handover.errors import InvalidSetting, NotFinite, UnknownKey
+from marl_handover.task.rules import Outcome
 
 KEYS = ("state", "goal")
 """Of the options that set a problem."""
@@ -23,6 +24,21 @@ IGNORED = "options"
 
 FIRST_DRAW, LARGEST_DRAW = 16, 1024
 """Problems are drawn in blocks, since one batched draw costs as much as one single draw: small ones first, for who seeds every episode."""
+
+
+def regret(outcome: Array, transfers: Array, optimum: Array | int, max_steps: int) -> Array:
+    """Transfers beyond the optimum (...) of episodes that are over: ``transfers`` - ``optimum``; if failed ``max_steps`` - ``optimum``.
+
+    A failure is so never better than a solution, however late, and it does not matter how soon it came. Where placements are noisy, luck
+    may solve a problem in less than the optimum of exact arms: the regret is negative then.
+
+    Args:
+        outcome: values of :class:`~marl_handover.task.rules.Outcome`, (...), numpy or torch.
+        transfers: made, (...).
+        optimum: (...).
+        max_steps: transfers allowed.
+    """
+    return namespace(transfers).where(outcome == int(Outcome.SUCCESS), transfers, max_steps) - optimum
 
 
 def sample_positions(cell: Cell, count: int, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -105,7 +121,15 @@ def _poses_in_each(cells: CellBatch, generator: torch.Generator, dtype: torch.dt
 
 
 class ProblemSource:
-    """Starts and goals of one cell; the generator it is given decides them."""
+    """Starts and goals of one cell; the generator it is given decides them.
+
+    Attributes:
+        seed: that an environment begins with if it is given none; None: any.
+        optimum: fewest transfers of the problem that came last, 0 if none are enough; None: not known.
+    """
+
+    seed: int | None = None
+    optimum: int | None = None
 
     def __init__(self, cell: Cell) -> None:
         self.cell = cell
@@ -115,6 +139,13 @@ class ProblemSource:
         """Forget what is drawn already, because the generator was seeded anew."""
         self._drawn: list[tuple[Floats, Floats]] = []
         self._block = FIRST_DRAW
+
+    def told(self, outcome: Outcome, transfers: int, over: bool, max_steps: int) -> dict[str, int]:
+        """What ``info`` says of the problem that came last: ``optimum`` where it is known, and ``regret`` when the episode is over."""
+        if self.optimum is None:
+            return {}
+        known = {"optimum": self.optimum}
+        return known | {"regret": int(regret(np.int64(outcome), np.int64(transfers), self.optimum, max_steps))} if over else known
 
     def next(self, generator: np.random.Generator, options: Mapping[str, Any] | None = None) -> tuple[Floats, Floats]:
         """Start and goal, each (3,): random, or as ``options`` say under ``state`` and ``goal``.
