@@ -15,7 +15,6 @@ from marl_handover.control.events import Event
 from marl_handover.control.session import GivenGoal
 from marl_handover.control.twin import Floats, Twin
 from marl_handover.hardware.emulator.device import make_fault
-from marl_handover.hardware.settings import ARMS
 from marl_handover.task.rules import Rules
 
 NUDGE_MM, NUDGE_RAD = 20.0, math.radians(20.0)
@@ -146,7 +145,9 @@ class FaultInjector:
 
     def _fault(self, mishap: InjectedFault, kind: str, duration_s: float) -> None:
         self._begins(mishap, duration_s)
-        self.twin.add_faults([make_fault(kind, mishap.at_s, duration_s)])
+        boards = tuple(self.twin.electronics.devices)
+        board = boards[0] if len(boards) == 1 else str(self._random.choice(boards))
+        self.twin.add_faults([make_fault(kind, mishap.at_s, duration_s)], board)
 
     def _freeze(self, mishap: InjectedFault) -> None:
         self._begins(mishap, _FROZEN_S)
@@ -159,7 +160,8 @@ class FaultInjector:
             self._at(_AGAIN_S, mishap)
             return
         self._begins(mishap, _JAMMED_S)
-        twin.add_faults([make_fault("jam", mishap.at_s, _JAMMED_S, twin.hardware.arms[arm].gripper.channel) for arm in ARMS])
+        for wiring in twin.hardware.arms.values():
+            twin.add_faults([make_fault("jam", mishap.at_s, _JAMMED_S, wiring.gripper.channel)], wiring.board)
 
     def _nudge(self, mishap: InjectedFault) -> None:
         """Somebody pushes the block, once it stands on the table and no hand is at it, nor where it comes to stand."""

@@ -13,7 +13,6 @@ from marl_handover.cell import build_cell
 from marl_handover.config import CELL_ALIASES, CellConfig, MotionConfig, bounded, check_bounds, chosen, seed_field
 from marl_handover.control.settings import WorkcellConfig
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.hardware.settings import ARMS
 
 if TYPE_CHECKING:
     from marl_handover.cell import CellModel
@@ -63,12 +62,12 @@ def run(config: CalibrateCommand) -> int:
     if config.what == "sheets":
         config.board.validate()
         config.target.validate()
-        config.hand_markers.validate(config.target)
+        config.hand_markers.validate(config.target, model.cell.num_arms)
         return _sheets(config, model)
     if config.what in ("all", "camera", "servos"):
         devices = open_devices(config, model, config.motion, confirmed)
         try:
-            operator: Operator = devices.twin or TerminalOperator(config.hand_markers)
+            operator: Operator = devices.twin or TerminalOperator(config.hand_markers, tuple(devices.hardware.arms))
             if config.what in ("all", "camera"):
                 _camera(config, devices, operator)
             if config.what in ("all", "servos"):
@@ -84,9 +83,12 @@ def _sheets(config: CalibrateCommand, model: CellModel) -> int:
     from marl_handover.perception.printables import PX_PER_MM, marker_sheet, page, save_sheet, write_sheets
 
     folder, cards, target = config.folder() / "sheets", config.hand_markers, config.target
+    ids = cards.numbers(model.cell.num_arms)
     files = write_sheets(folder, model.cell.config.block, target, config.board, config.paper)
-    sheets = [marker_sheet(target.dictionary, number, cards.marker_mm, cards.marker_mm + _CUT_MM, PX_PER_MM) for number in cards.ids]
-    words = f"markers {cards.ids[0]} for the left hand, {cards.ids[1]} for the right: flat on top, upper edge to the left"
+    sheets = [marker_sheet(target.dictionary, number, cards.marker_mm, cards.marker_mm + _CUT_MM, PX_PER_MM) for number in ids]
+    (name, first), *others = zip(config.hardware.for_arms(model.cell.names).arms, ids, strict=True)
+    rest = "".join(f", {number} for the {arm}" for arm, number in others)
+    words = f"markers {first} for the {name} hand{rest}: flat on top, upper edge to the left"
     files.append(folder / "hands.pdf")
     save_sheet(page(sheets, config.paper, "hands", words), files[-1])
     for path in files:
@@ -123,7 +125,7 @@ def _servos(config: CalibrateCommand, devices: Devices, operator: Operator, mode
     with driver:
         driver.arm()
         procedure = ServoCalibration(driver, devices.camera, seen_by, config.target, config.hand_markers, config.seed, config.postures)
-        for arm, name in enumerate(ARMS):
+        for arm, name in enumerate(driver.config.arms):
             found[name] = measured = procedure.arm(arm)
             print(
                 f"{name} arm: seen in {measured.sightings} postures, {measured.residual_mm:.2f} mm off, {_bands(measured)}, "
@@ -149,14 +151,15 @@ def _grippers(config: CalibrateCommand, model: CellModel) -> None:
     planner = MotionPlanner(model, config.motion)
     planner.warm_up()
     backend = HardwareBackend(model, config.motion, config=config, confirm=confirmed, grippers=False)
+    names = tuple(backend.workcell.driver.config.arms)
     found: dict[str, Grip] = {}
     try:
-        operator: Operator = backend.workcell.twin or TerminalOperator(config.hand_markers)
+        operator: Operator = backend.workcell.twin or TerminalOperator(config.hand_markers, names)
         first = places(model.cell)[0]
         operator.stand_block(first)
         backend.reset(np.array(first), config.seed)
-        procedure = GripperCalibration(backend, planner, operator, _told)
-        for arm, name in enumerate(ARMS):
+        procedure = GripperCalibration(backend, planner, operator, lambda arm, further_mm, held: _told(names[arm], further_mm, held))
+        for arm, name in enumerate(names):
             found[name] = grip = procedure.arm(arm)
             print(
                 f"{name} gripper: {grip.off_mm:+.1f} mm further than set, after {grip.tries} tries: "
@@ -164,13 +167,13 @@ def _grippers(config: CalibrateCommand, model: CellModel) -> None:
             )
     finally:
         backend.close()
-    asked = {name: config.hardware.arms[name].gripper for name in ARMS}
+    asked = {name: config.hardware.arms[name].gripper for name in names}
     print(f"-> {save_grippers(config.folder(), asked, {name: grip.gripper for name, grip in found.items()})}")
 
 
-def _told(arm: int, further_mm: float, held: bool) -> None:
+def _told(arm: str, further_mm: float, held: bool) -> None:
     """One try of a gripper."""
-    print(f"{ARMS[arm]} gripper, {further_mm:+.1f} mm: {'holds' if held else 'does not hold'}", file=sys.stderr)
+    print(f"{arm} gripper, {further_mm:+.1f} mm: {'holds' if held else 'does not hold'}", file=sys.stderr)
 
 
 def _require_good(name: str, measured: Measured, worst_mm: float) -> None:

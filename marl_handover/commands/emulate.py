@@ -1,4 +1,4 @@
-"""``marl-handover emulate``: a servo controller on a pseudo-terminal, for trying out whatever talks to one."""
+"""``marl-handover emulate``: servo controllers on pseudo-terminals, for trying out whatever talks to one."""
 
 from __future__ import annotations
 
@@ -10,17 +10,21 @@ from marl_handover.config import path_field, require_choice, require_seed
 from marl_handover.errors import InvalidSetting, WorkFailed
 from marl_handover.hardware.settings import HardwareConfig
 
+_SHARED_S = 0.002
+"""So long the others wait for the turn of a board at which nothing happens: replies are to come in time."""
+
 if TYPE_CHECKING:
     from marl_handover.hardware.emulator.device import EmulatedDevice
+    from marl_handover.hardware.emulator.pty import PtyEmulator
 
 
 @dataclass
 class EmulateConfig:
     """Keys of ``emulate``."""
 
-    link: str = path_field("runs/ssc32")  # symlink to the port; give it as hardware.boards.main.port to a run
+    link: str = path_field("runs/ssc32")  # symlink to the port; give it as the board's port to a run
     faults: str = ""  # kind@start_s[:duration_s][=amount],...: unplug brownout silent drop corrupt late stuck ignore random frozen jam
-    board: str = "main"  # which of the boards in hardware.boards
+    board: str = ""  # which of the boards in hardware.boards; empty: all, those after the first at link_BOARD
     lines: bool = False  # print every line that comes in
     hardware: HardwareConfig = field(default_factory=HardwareConfig)
 
@@ -33,40 +37,63 @@ GROUPS: dict[str, dict[str, type]] = {}
 def run(config: EmulateConfig) -> int:
     """Serve until Ctrl-C or SIGTERM, which is how it is meant to end: 0 then."""
     try:
-        from marl_handover.hardware.emulator.pty import PtyEmulator
+        from marl_handover.hardware.emulator.pty import IDLE_S
     except ImportError as error:
         raise WorkFailed(f"emulate needs pseudo-terminals, which this system does not have ({error})") from error
 
-    emulator = PtyEmulator(_device(config), config.link)
+    emulators = _served(config)
+    idle_s = IDLE_S if len(emulators) == 1 else _SHARED_S
     stopped: list[int] = []
     before = {number: signal.signal(number, lambda number, _: stopped.append(number)) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        print(f"{emulator.device.board.firmware.text} at {config.link}, {emulator.device.baud} baud; Ctrl-C ends it", flush=True)
+        for emulator in emulators:
+            print(f"{emulator.device.board.firmware.text} at {emulator.link}, {emulator.device.baud} baud; Ctrl-C ends it", flush=True)
         while not stopped:
-            emulator.turn()
-            while config.lines and emulator.device.lines:
-                t_s, line = emulator.device.lines.popleft()
-                print(f"{t_s:10.4f} s  {line.decode('ascii', 'backslashreplace').rstrip()}", flush=True)
+            for emulator in emulators:
+                emulator.turn(idle_s)
+                while config.lines and emulator.device.lines:
+                    t_s, line = emulator.device.lines.popleft()
+                    print(f"{t_s:10.4f} s  {line.decode('ascii', 'backslashreplace').rstrip()}", flush=True)
     finally:
-        emulator.close()
+        for emulator in emulators:
+            emulator.close()
         for number, handler in before.items():
             signal.signal(number, handler)
     return 0
 
 
-def _device(config: EmulateConfig) -> EmulatedDevice:
-    """The board that is asked for, with its servos where a lab puts the arms before switching on."""
+def _served(config: EmulateConfig) -> list[PtyEmulator]:
+    """The boards that are asked for, on their ports; if one cannot be served, none is."""
+    from marl_handover.hardware.emulator.pty import PtyEmulator
+
+    emulators: list[PtyEmulator] = []
+    try:
+        for number, (name, device) in enumerate(_devices(config).items()):
+            emulators.append(PtyEmulator(device, f"{config.link}_{name}" if number else config.link))
+    except BaseException:
+        for emulator in emulators:
+            emulator.close()
+        raise
+    return emulators
+
+
+def _devices(config: EmulateConfig) -> dict[str, EmulatedDevice]:
+    """The boards that are asked for, with their servos where a lab puts the arms before switching on."""
     from marl_handover.cell.build import build_cell, cell_config
     from marl_handover.config import MotionConfig
     from marl_handover.hardware.emulator.device import EmulatedCell, parse_faults
     from marl_handover.motion.home import parked_poses
 
     require_seed(config.hardware.emulator.seed)
-    require_choice("board", config.board, tuple(config.hardware.boards))
+    if config.board:
+        require_choice("board", config.board, tuple(config.hardware.boards))
     faults = parse_faults(config.faults)
-    model = build_cell(cell_config("paper"))
-    cell = EmulatedCell(config.hardware, model.arm, parked_poses(model, MotionConfig())[0])
-    if config.board not in cell.devices:
+    config.hardware.validate()
+    model = build_cell(cell_config("paper"))  # joint limits and parked pose are the robot's, wherever it stands
+    cell = EmulatedCell(config.hardware.for_arms(), model.arm, parked_poses(model, MotionConfig())[0])
+    if config.board and config.board not in cell.devices:
         raise InvalidSetting("board", config.board, f"one that an arm is wired to: {', '.join(cell.devices)}")
-    cell.devices[config.board].add_faults(faults)
-    return cell.devices[config.board]
+    served = {name: device for name, device in cell.devices.items() if config.board in ("", name)}
+    for device in served.values():
+        device.add_faults(faults)
+    return served

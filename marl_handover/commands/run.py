@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,7 +89,7 @@ def run(config: RunCommand) -> int:
             begun = time.perf_counter()
             episode = _play(config, session, loop, start, goal, config.seed + number)
             solved += episode.solved
-            _tell(number, episode, time.perf_counter() - begun)
+            _tell(number, episode, time.perf_counter() - begun, loop.rules.cell.labels)
         faults = {str(event): count for event, count in sorted(session.log.counts.items()) if event in _faults()}
     where = "would be at the goal (dry run: nothing moved)" if config.dry_run else "at the goal"
     print(f"{solved} of {config.episodes} {where}; what went wrong: {', '.join(f'{n} {c}' for n, c in faults.items()) or 'nothing'}")
@@ -139,12 +139,12 @@ def _play(config: RunCommand, session: Session, loop: ClosedLoop, start: Floats,
     return session.play(start, session.printed, seed)
 
 
-def _tell(number: int, episode: Episode, wall_s: float) -> None:
+def _tell(number: int, episode: Episode, wall_s: float, labels: Sequence[str]) -> None:
     from marl_handover.control.session import transfer_line
 
     print(f"episode {number}: {episode.ended} after {counted(len(episode.transfers), 'transfer')}, {wall_s:.1f} s", flush=True)
     for transfer in episode.transfers:
-        print(transfer_line(transfer))
+        print(transfer_line(transfer, labels))
 
 
 def _faults() -> frozenset[Any]:

@@ -91,8 +91,8 @@ def laid_anew() -> None:
 class TerminalOperator:
     """A person at a terminal, who is told what to do and presses Enter when it is done."""
 
-    def __init__(self, cards: CardConfig) -> None:
-        self._cards = cards
+    def __init__(self, cards: CardConfig, arms: Sequence[str] = ARMS) -> None:
+        self._cards, self._arms = cards, arms
 
     def hold_board(self, sheet: Sheet, number: int, count: int) -> None:
         """See the protocol."""
@@ -114,8 +114,10 @@ class TerminalOperator:
     def glue_cards(self) -> None:
         """See the protocol."""
         x, y, z = self._cards.place_mm
+        (first, marker), *others = zip(self._arms, self._cards.numbers(len(self._arms)), strict=True)
+        where = "".join(f", {number} on the {arm} one" for arm, number in others)
         _wait(
-            f"fix marker {self._cards.ids[0]} flat on the left hand, {self._cards.ids[1]} on the right one: middle {-x:g} mm "
+            f"fix marker {marker} flat on the {first} hand{where}: middle {-x:g} mm "
             f"behind the grip, {y:g} mm to its left, {z:g} mm above it, its upper edge to the left"
         )
 
@@ -162,9 +164,19 @@ def calibrate_camera(
     return locate_by_board(lens, laid, board, name)
 
 
-def places(cell: Cell) -> tuple[tuple[float, float, float], ...]:
-    """Between these, x_mm, y_mm, theta_rad, the block is carried; both arms of ``cell`` reach them."""
-    return tuple((float(x), float(y), 0.0) for x, y in cell.shared.to_table(np.array([-_ALPHA, _ALPHA]), np.zeros(2)))
+def places(cell: Cell, arm: int = 0) -> tuple[tuple[float, float, float], ...]:
+    """Between these, x_mm, y_mm, theta_rad, ``arm`` carries the block; the other arm of :func:`partners` reaches them, too."""
+    table = cell.graph.edges[partners(cell, arm)].to_table(np.array([-_ALPHA, _ALPHA]), np.zeros(2))
+    return tuple((float(x), float(y), 0.0) for x, y in table)
+
+
+def partners(cell: Cell, arm: int) -> tuple[int, int]:
+    """Of the pairs that share a place with ``arm`` the one with the longest way between two of its places."""
+
+    def shorter(pair: tuple[int, int]) -> float:
+        return -math.dist(*cell.graph.edges[pair].to_table(np.array([-_ALPHA, _ALPHA]), np.zeros(2)))
+
+    return min((pair for pair in sorted(cell.graph.edges) if arm in pair), key=shorter)
 
 
 class Grip(NamedTuple):
@@ -193,7 +205,7 @@ class GripperCalibration:
         progress: Callable[[int, float, bool], object] = lambda arm, further_mm, held: None,
     ) -> None:
         self.backend, self.planner, self.operator, self.progress = backend, planner, operator, progress
-        self.places = places(backend.model.cell)
+        self._names = tuple(backend.workcell.driver.config.arms)
 
     def arm(self, arm: int) -> Grip:
         """Calibrate one hand; the cell goes on with what was found.
@@ -202,20 +214,21 @@ class GripperCalibration:
             CalibrationProblem: it never carried the block, or did so where it should not have touched it.
             Stopped, DeviceError, BlockNotSeen: as :meth:`HardwareBackend.execute`.
         """
-        wiring = self.backend.workcell.driver.config.arms[ARMS[arm]]
-        asked = self.backend.workcell.config.hardware.arms[ARMS[arm]].gripper
+        name = self._names[arm]
+        wiring = self.backend.workcell.driver.config.arms[name]
+        asked = self.backend.workcell.config.hardware.arms[name].gripper
         tries = np.arange(-RANGE_MM, RANGE_MM + STEP_MM / 2, STEP_MM)
         for number, further_mm in enumerate(tries, start=1):
             wiring.gripper = shifted(asked, float(further_mm))
             held = self._carries(arm)
             self.progress(arm, float(further_mm), held)
             if held and number == 1:
-                raise CalibrationProblem(f"the {ARMS[arm]} gripper", self._words(asked, f"it holds the pin {RANGE_MM:g} mm too early"))
+                raise CalibrationProblem(f"the {name} gripper", self._words(asked, f"it holds the pin {RANGE_MM:g} mm too early"))
             if held:
                 off_mm = float(further_mm) + SURE_MM
                 wiring.gripper = shifted(asked, off_mm)
                 return Grip(wiring.gripper, off_mm, number)
-        raise CalibrationProblem(f"the {ARMS[arm]} gripper", self._words(asked, f"it does not hold the pin, {RANGE_MM:g} mm further"))
+        raise CalibrationProblem(f"the {name} gripper", self._words(asked, f"it does not hold the pin, {RANGE_MM:g} mm further"))
 
     def _words(self, asked: GripperConfig, what: str) -> str:
         return (
@@ -224,22 +237,24 @@ class GripperCalibration:
 
     def _carries(self, arm: int) -> bool:
         """Whether the hand, as it is set now, takes the block to the other place."""
-        pose = self._block()
-        place = max((np.asarray(place[:2]) for place in self.places), key=lambda place: math.dist(place, pose[:2]))
+        pose = self._block(arm)
+        place = max((np.asarray(place[:2]) for place in places(self.backend.model.cell, arm)), key=lambda place: math.dist(place, pose[:2]))
         joints = self.backend.joints_rad()
         motion = self.planner.plan_paths(arm, pose[:2], place, joints[arm], np.delete(joints, arm, axis=0))
         refusal = self.backend.execute(arm, motion.paths).refusal
         return refusal is None
 
-    def _block(self) -> Floats:
-        """Where the block stands; where nobody sees it, or an arm does not reach it, it is put back."""
+    def _block(self, arm: int) -> Floats:
+        """Where the block stands; where nobody sees it, or ``arm`` or its partner does not reach it, it is put back."""
+        cell = self.backend.model.cell
         try:
             pose = self.backend.watch()
         except BlockNotSeen as lost:
             if not lost.camera_works:
                 raise
             pose = None
-        if pose is not None and bool(self.backend.model.cell.reaches(pose[:2]).all()):
+        if pose is not None and bool(cell.reaches(pose[:2])[list(partners(cell, arm))].all()):
             return pose
-        self.operator.stand_block(self.places[0])
-        return self.backend.reset(np.asarray(self.places[0]), 0)
+        first = places(cell, arm)[0]
+        self.operator.stand_block(first)
+        return self.backend.reset(np.asarray(first), 0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from types import TracebackType
@@ -191,6 +191,8 @@ _IN_MOTION = frozenset(
 class SessionDigest:
     """Takes the rows of an :class:`~marl_handover.control.events.EventLog` one by one. Poses in mm and rad, as lists.
 
+    ``labels`` are what rows call the arms.
+
     Attributes:
         doing: one of the words above.
         text: about the last thing that went wrong in this episode, or how the last one ended.
@@ -206,7 +208,8 @@ class SessionDigest:
         stopped: why, once the stop was obeyed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, labels: Sequence[str] = ARM_LETTERS) -> None:
+        self._labels = tuple(labels)
         self.doing, self.text = STARTING, ""
         self.arm, self.begun = -1, False
         self.phases: list[tuple[str, float, float]] = []
@@ -223,7 +226,7 @@ class SessionDigest:
         event = Event(row["event"])
         if event in FAULTS:
             self.faults[event] += 1
-            self.text = _told(event, row)
+            self.text = _told(event, row, self._labels)
         self.doing = _WAITING.get(event) or _DOING.get(event) or self.doing
         if event is Event.STATE:
             self.begun = self.arm >= 0
@@ -261,7 +264,7 @@ class SessionDigest:
         self.transfers += 1
         self.moved += 1
         self.pose = row["next_state"]
-        arm = ARM_LETTERS.index(row["arm"])
+        arm = self._labels.index(row["arm"])
         if row["refusal"] is None:
             self.previous_arm = arm
             self.stalled.discard(arm)
@@ -281,8 +284,8 @@ class SessionDigest:
         self.stopped = row["reason"]
 
 
-def _told(event: Event, row: dict[str, Any]) -> str:
+def _told(event: Event, row: dict[str, Any], labels: Sequence[str]) -> str:
     """A fault in a line."""
-    arm = f", arm {ARM_LETTERS[row['arm']]}" if "arm" in row else ""
+    arm = f", arm {labels[row['arm']]}" if "arm" in row else ""
     detail = row.get("text") or row.get("reason") or ""
     return f"{str(event).replace('_', ' ')}{arm}{': ' if detail else ''}{detail}"

@@ -17,14 +17,14 @@ from marl_handover.arrays import Floats, wrap
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.control.events import Event
-from marl_handover.control.settings import TWIN, WorkcellConfig, twin_workcell
+from marl_handover.control.settings import WorkcellConfig, twin_workcell
 from marl_handover.control.trajectory_player import TrajectoryPlayer
 from marl_handover.control.workcell import open_workcell
 from marl_handover.envs.backends import Execution
 from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
 from marl_handover.errors import WorkFailed
 from marl_handover.hardware.estop import PrivateStop, StopLatch
-from marl_handover.hardware.settings import HardwareConfig
+from marl_handover.hardware.settings import HardwareConfig, twin_of
 from marl_handover.motion.pick_place import timed_phases
 from marl_handover.motion.trajectory import LOADED_PHASES, Phase, PickPlacePaths
 from marl_handover.perception.calibration import Pixels
@@ -149,7 +149,7 @@ class HardwareBackend:
         return self._last.pose.copy()
 
     def execute(self, arm: int, paths: PickPlacePaths) -> Execution:
-        """Time one cycle of ``arm``, play it, park, look; the other arm holds still.
+        """Time one cycle of ``arm``, play it, park, look; the other arms hold still.
 
         Raises:
             Stopped: the stop is latched.
@@ -299,6 +299,6 @@ class TwinBackend(HardwareBackend):
         config = twin_workcell()
         config.twin.engine = engine
         if hardware is not None:
-            config.hardware = replace(hardware, name=TWIN)
+            config.hardware = replace(hardware, name=twin_of(hardware.name))
         config.calibration = calibration or ""
         super().__init__(model, motion, config=config, latch=None if config.hardware.stop_file else PrivateStop())

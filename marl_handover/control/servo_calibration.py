@@ -89,6 +89,7 @@ def solve_calibration(
     yaw_sd_deg: float = 1.0,
     zero_sd_deg: float = 5.0,
     scale_sd: float = 0.05,
+    arm: int | None = None,
 ) -> SolvedCalibration:
     """The calibration that explains the sightings best.
 
@@ -102,11 +103,13 @@ def solve_calibration(
         yaw_sd_deg: the same of its yaw.
         zero_sd_deg: how well zeros were known, in degrees of the joint.
         scale_sd: how well scales were known, relative.
+        arm: its index in the cell; None: that of the arm of a pair whose name ``before`` has.
 
     Raises:
         Unexplained: half of the sightings are off by more than :data:`WORST_MM`, or no best explanation was found.
         CalibrationProblem: too few sightings, or none of them finite; or what comes out is no servo.
     """
+    arm = ARMS.index(before.arm) if arm is None else arm
     usable = [sighting for sighting in sightings if np.isfinite(sighting.pulses_us).all() and np.isfinite(sighting.seen_mm).all()]
     if len(usable) < LEAST_SIGHTINGS:
         raise CalibrationProblem(before.arm, f"{len(usable)} usable sightings; {LEAST_SIGHTINGS} are needed at least")
@@ -124,11 +127,11 @@ def solve_calibration(
         return middle + shift + (angles - middle) * (1.0 + stretch)
 
     def residuals(parameters: Floats) -> Floats:
-        off_mm, off_rad = _misses(model, ARMS.index(before.arm), joints(parameters), usable)
+        off_mm, off_rad = _misses(model, arm, joints(parameters), usable)
         return np.concatenate([(off_mm / position_sd_mm).ravel(), off_rad / math.radians(yaw_sd_deg), parameters / weights])
 
     found = least_squares(residuals, np.zeros(len(weights)), x_scale=weights, loss="soft_l1")
-    off_mm, _ = _misses(model, ARMS.index(before.arm), joints(found.x), usable)
+    off_mm, _ = _misses(model, arm, joints(found.x), usable)
     _require_explained(before.arm, off_mm, found.success, found.message)
     ends = np.stack([model.arm.lower_rad, model.arm.upper_rad])
     at_us = zeros + slopes * (middle + (ends - middle - found.x[:5]) / (1.0 + found.x[5:10]))
@@ -232,6 +235,8 @@ class ServoCalibration:
         postures: int = POSTURES,
     ) -> None:
         self.driver, self.camera, self.seen_by, self.cards, self.count = driver, camera, seen_by, cards, postures
+        self._names = tuple(driver.config.arms)
+        self._markers = cards.numbers(len(self._names))
         self._random = np.random.default_rng(seed)
         edge_px = cards.marker_mm * seen_by.px_per_mm(_TYPICAL_HEIGHT_MM)
         self._finder = MarkerFinder(target.dictionary, edge_px, _OPENING_PX)
@@ -250,10 +255,12 @@ class ServoCalibration:
         self.driver.drive(arm, self.driver.parked_rad, self.driver.gripper_mm(arm), _SPEED_DEG_S)
         if len(sightings) < 4 * LEAST_SIGHTINGS:
             raise CalibrationProblem(
-                ARMS[arm], f"the marker on its hand was seen in {len(sightings) // 4} of {self.count} postures; is it glued on, is it lit?"
+                self._names[arm],
+                f"the marker on its hand was seen in {len(sightings) // 4} of {self.count} postures; is it glued on, is it lit?",
             )
         before = self.driver.calibrations[arm]
-        found = solve_calibration(self.driver.model, before, sightings, position_sd_mm=_SIGHT_SD_MM, yaw_sd_deg=_YAW_SD_DEG)
+        sure = {"position_sd_mm": _SIGHT_SD_MM, "yaw_sd_deg": _YAW_SD_DEG}
+        found = solve_calibration(self.driver.model, before, sightings, arm=arm, **sure)
         seen = len(sightings) // 4
         return Measured(found.calibration, found.half_band_us, found.half_band_sd_us, found.residual_mm, seen, found.joint_sd_deg)
 
@@ -266,10 +273,10 @@ class ServoCalibration:
         except CommandRejected:
             return []
         self.driver.wait(_SETTLE_S)
-        wiring = self.driver.config.arms[ARMS[arm]]
+        wiring = self.driver.config.arms[self._names[arm]]
         sent = self.driver.wiring.pulses([JointCommand(arm, posture.joints_rad, fingers)])[wiring.board]
         pulses = np.array([sent[channel] for channel in wiring.channels], float)
-        number = self.cards.ids[arm]
+        number = self._markers[arm]
         found = self._finder.find(_grey(self.camera.read().image), [number]).get(number)
         if found is None:
             return []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -155,9 +155,9 @@ class Session:
         self.log.add(Event.TRANSFER, **transfer_row(transfer, self.loop.rules))
 
 
-def transfer_line(transfer: Transfer) -> str:
-    """A transfer for people."""
+def transfer_line(transfer: Transfer, labels: Sequence[str] = ARM_LETTERS) -> str:
+    """A transfer for people; ``labels`` are what they call the cell's arms."""
     command, result = transfer.command, transfer.result
     where = "the goal" if command.final else f"({command.place_mm[0]:z.0f}, {command.place_mm[1]:z.0f})"
     came = result.refusal or f"({result.pose[0]:z.1f}, {result.pose[1]:z.1f}) mm, {np.degrees(result.pose[2]):z.1f} deg"
-    return f"  {ARM_LETTERS[command.arm]} to {where}: {came}"
+    return f"  {labels[command.arm]} to {where}: {came}"

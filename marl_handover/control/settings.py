@@ -11,7 +11,7 @@ from marl_handover.compose import from_yaml
 from marl_handover.config import ENGINES, bounded, check_bounds, chosen, path_field, require_between, seed_field
 from marl_handover.errors import InvalidSetting
 from marl_handover.files import resource_path
-from marl_handover.hardware.settings import ARMS, TWIN, HardwareConfig
+from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.perception.settings import (
     MARKERS,
     BoardConfig,
@@ -70,17 +70,21 @@ class TwinConfig:
 class CardConfig:
     """The printed markers that are glued onto the hands while servos are calibrated: which, how large, and where in the grip's frame."""
 
-    ids: list[int] = bounded([2, 3], 0, 10_000, (1, 32))  # left arm's, right arm's; of target.dictionary
+    ids: list[int] | None = bounded(None, 0, 10_000, (1, 32))  # of target.dictionary, one an arm, in order; null: 2, 3 and so on
     marker_mm: float = bounded(30.0, 4.0, 200.0)
     place_mm: list[float] = bounded([-47.0, 0.0, 13.2], -500.0, 500.0, (3, 3))  # its middle: flat on the hand, x along the fingers
 
-    def validate(self, target: TargetConfig) -> None:
+    def numbers(self, arms: int) -> list[int]:
+        """The markers of so many arms."""
+        return list(range(2, 2 + arms)) if self.ids is None else self.ids
+
+    def validate(self, target: TargetConfig, arms: int) -> None:
         """Raise :class:`InvalidSetting` on a value out of its limits, or a marker that means something else in ``target``."""
         check_bounds(self, "hand_markers.")
-        count, taken = MARKERS[target.dictionary], {target.block_id, target.goal_id}
-        if len(self.ids) != len(ARMS) or len({*self.ids} - taken) != len(ARMS) or not all(0 <= number < count for number in self.ids):
-            wanted = f"two different numbers from 0 to {count - 1} that are neither target.block_id nor target.goal_id"
-            raise InvalidSetting("hand_markers.ids", self.ids, wanted)
+        count, taken, ids = MARKERS[target.dictionary], {target.block_id, target.goal_id}, self.numbers(arms)
+        if len(ids) != arms or len({*ids} - taken) != arms or not all(0 <= number < count for number in ids):
+            wanted = f"{arms} different numbers from 0 to {count - 1}, one an arm, that are neither target.block_id nor target.goal_id"
+            raise InvalidSetting("hand_markers.ids", ids, wanted)
 
 
 @dataclass
@@ -104,18 +108,21 @@ class WorkcellConfig:
     @property
     def emulated(self) -> bool:
         """Whether this is the twin."""
-        return self.hardware.name == TWIN
+        return self.hardware.emulated
 
     def folder(self) -> Path:
         """Where the calibration is kept."""
         return Path(self.calibration or f"runs/calibration/{self.hardware.name}")
 
-    def validate(self) -> None:
-        """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits, or one that this cell does not use."""
+    def validate(self, arms: Sequence[str] | None = None) -> None:
+        """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits, or one that this cell does not use.
+
+        ``arms`` are those of the cell, by name; None: those that ``hardware`` has wiring for.
+        """
         check_bounds(self)
         for part in (self.hardware, self.board, self.target, self.detector, self.tracker, self.watch, self.mount, self.look, self.twin):
             part.validate()
-        self.hand_markers.validate(self.target)
+        self.hand_markers.validate(self.target, len(self.hardware.for_arms(arms).arms))
         if self.watch.steady_frames < self.tracker.frozen_frames:
             raise InvalidSetting(
                 "watch.steady_frames", self.watch.steady_frames, f"at least tracker.frozen_frames = {self.tracker.frozen_frames}"

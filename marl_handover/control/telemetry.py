@@ -28,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marl_handover.arrays import Floats
-from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.control.events import Event, SessionDigest
 from marl_handover.control.remote_control import CommandQueue, ControlFolder
 from marl_handover.control.telemetry_reader import EVENTS_FILE, FORMAT, PICTURE_FILE, STATE_FILE, VERSION, TelemetryReader, require_own
@@ -36,7 +35,6 @@ from marl_handover.control.transfers import Placement, rollout
 from marl_handover.errors import HandoverError, InvalidSetting
 from marl_handover.files import GrowingFile, write_whole
 from marl_handover.hardware.errors import Stopped
-from marl_handover.hardware.settings import ARMS
 from marl_handover.motion.trajectory import LOADED_PHASES
 from marl_handover.palette import FAINT, PAPER, YELLOW
 from marl_handover.perception.camera import Frame
@@ -262,7 +260,7 @@ class SessionState:
     """
 
     def __init__(self, loop: ClosedLoop, backend: HardwareBackend, command_queue: CommandQueue) -> None:
-        self.digest, self.backend, self._desk = SessionDigest(), backend, command_queue
+        self.digest, self.backend, self._desk = SessionDigest(loop.rules.cell.labels), backend, command_queue
         self._policy, self._whole = deepcopy(loop.policy), loop.rules.cell
         """Of its own: asking the session's would change what one that draws lots does next."""
         self._reach_slack_mm = loop.settings.reach_slack_mm
@@ -333,13 +331,13 @@ class SessionState:
     def _arms(self, phase: str) -> list[dict[str, Any]]:
         joints = np.round(self.backend.joints_rad(), _JOINT_DIGITS)
         digest, driver, rows = self.digest, self.backend.workcell.driver, []
-        for arm, name in enumerate(ARMS):
+        for arm, name in enumerate(driver.config.arms):
             known = bool(np.isfinite(joints[arm]).all())
             fingers = driver.gripper_mm(arm)
             rows.append(
                 {
                     "name": name,
-                    "letter": ARM_LETTERS[arm],
+                    "letter": self._whole.labels[arm],
                     "joints_rad": joints[arm].tolist() if known else None,
                     "gripper_mm": round(fingers, 2) if math.isfinite(fingers) else None,
                     "moving": digest.begun and digest.arm == arm,

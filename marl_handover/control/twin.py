@@ -16,6 +16,8 @@ from marl_handover.arrays import Floats
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.control.settings import WorkcellConfig
+from marl_handover.errors import InvalidSetting
+from marl_handover.geometry.arm_model import Bools
 from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.emulator.device import EmulatedCell, Fault
@@ -24,6 +26,7 @@ from marl_handover.perception.calibration import Pixels, hung_camera
 from marl_handover.perception.camera import Frame, RenderedCamera
 from marl_handover.perception.printables import Sheet, marker_sheet
 from marl_handover.perception.scene import CellPainter, held_boards
+from marl_handover.perception.settings import USUAL_EYE_MM, MountConfig
 from marl_handover.simulation.arm import SERVO_S
 from marl_handover.simulation.follower import ServoFollower, ServoState
 from marl_handover.simulation.world import SimulatedCell
@@ -32,6 +35,36 @@ _BOOTED_S = 1.0
 _HAND_STEP_S, _HAND_S = 0.02, 1.0
 _LIFTED_MM, _LEANING_RAD = 3.0, math.radians(3.0)
 _EDGE_MM = 1e4
+_RIM_PX, _LEAST_MARKER_PX = 25, 18.0
+"""What is kept free around all that arms reach, since no camera hangs straight; edge of a marker that is found well."""
+
+
+def mount_over(model: CellModel, config: WorkcellConfig) -> MountConfig:
+    """How the camera of ``config`` hangs over a cell: as it says, else as over a pair, or so that it sees all that more arms reach.
+
+    That is high enough, and turned by a right angle if the cell is longer along x.
+
+    Raises:
+        InvalidSetting: its pictures are too small for so large a table; a block's marker would not be found in them.
+    """
+    mount, camera = config.mount, config.camera
+    if mount.eye_mm is not None or model.cell.num_arms <= 2:
+        return mount
+    reached: Bools = np.any(model.grid.masks, axis=0)
+    x_mm, y_mm = model.grid.x_mm[reached.any(axis=1)], model.grid.y_mm[reached.any(axis=0)]
+    sides, room_px = np.array([np.ptp(y_mm), np.ptp(x_mm)]), np.array([camera.width_px, camera.height_px]) - 2 * _RIM_PX
+    ways = {0.0: float(max(sides / room_px)), 90.0: float(max(sides[::-1] / room_px))}  # world x is up in the picture, or to its right
+    turned_deg = min(ways, key=lambda way: ways[way])
+    mm_per_px = ways[turned_deg]
+    marker_px = model.cell.config.block.marker_mm / mm_per_px
+    if marker_px < _LEAST_MARKER_PX:
+        larger = math.ceil(camera.height_px * _LEAST_MARKER_PX / marker_px)
+        limit = f"at least {larger}, width_px as much larger, to see all of the cell"
+        raise InvalidSetting("camera.height_px", camera.height_px, limit)
+    x, y, z = USUAL_EYE_MM
+    above = math.ceil((mount.focal_px * mm_per_px + model.cell.config.block.height_mm) / 10) * 10
+    eye = [float(x_mm.min() + x_mm.max()) / 2 + x, float(y_mm.min() + y_mm.max()) / 2 + y, above + z % 10]
+    return replace(mount, eye_mm=eye, turn_deg=mount.turn_deg + turned_deg)
 
 
 class Twin:
@@ -48,16 +81,17 @@ class Twin:
         self._random = np.random.default_rng(config.twin.seed)
         self.clock = VirtualClock()
         self._parked = parked_poses(model, motion)[0]
-        self.electronics = EmulatedCell(config.hardware, model.arm, self._parked, motion.finger_travel_mm)
+        wired = config.hardware.for_arms(model.cell.names)
+        self.electronics = EmulatedCell(wired, model.arm, self._parked, motion.finger_travel_mm)
         ports = self.electronics.mount(self.clock)
         self.hardware = replace(
-            config.hardware,
-            boards={name: replace(board, port=ports.get(name, board.port), scan=False) for name, board in config.hardware.boards.items()},
+            wired,
+            boards={name: replace(board, port=ports.get(name, board.port), scan=False) for name, board in wired.boards.items()},
         )
-        """The electronics' settings, their ports those of the emulated boards."""
+        """The electronics' settings, of the cell's arms alone, their ports those of the emulated boards."""
         self.cell = SimulatedCell(model, motion, engine=config.twin.engine)
         self.follower = ServoFollower(self.cell, self._servos)
-        truth = hung_camera(config.mount, (config.camera.width_px, config.camera.height_px))
+        truth = hung_camera(mount_over(model, config), (config.camera.width_px, config.camera.height_px))
         self.painter = CellPainter(model, truth, config.target, config.look, config.twin.seed)
         self.camera = RenderedCamera(self._picture, config.camera.max_age_s, self.clock.now_s)
         self.goal: Floats | None = None
@@ -96,10 +130,11 @@ class Twin:
         """The camera gives its last picture again and again."""
         self.frozen_until_s = self.clock.now_s() + duration_s
 
-    def add_faults(self, faults: Sequence[Fault]) -> None:
-        """Faults of the electronics, on every board; times are the clock's."""
-        for device in self.electronics.devices.values():
-            device.add_faults(faults)
+    def add_faults(self, faults: Sequence[Fault], board: str | None = None) -> None:
+        """Faults of the electronics, on one ``board`` or on every one; times are the clock's."""
+        for name, device in self.electronics.devices.items():
+            if board in (None, name):
+                device.add_faults(faults)
 
     def confirm(self, question: str) -> bool:
         """The twin's operator: does what is asked, and says so.
@@ -133,7 +168,7 @@ class Twin:
         """Somebody glues the marker cards onto the hands, as exactly as people do."""
         cards, people = self.config.hand_markers, self.config.twin
         self._cards = []
-        for number in cards.ids:
+        for number in cards.numbers(self.model.cell.num_arms):
             off = self._random.normal(size=3) * (people.card_sd_mm, people.card_sd_mm, math.radians(people.card_sd_deg))
             place = np.asarray(cards.place_mm) + (off[0], off[1], 0.0)
             sheet = marker_sheet(self.config.target.dictionary, number, cards.marker_mm, cards.marker_mm * 4 / 3)

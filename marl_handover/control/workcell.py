@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,13 +18,13 @@ from marl_handover.control.twin import Twin
 from marl_handover.errors import MissingFile
 from marl_handover.hardware.calibration import (
     BACKLASH_FILE,
-    SERVO_FILES,
     SET_FILE,
     arm_file,
     calibrations,
     half_bands_rad,
     load_backlash,
     require_one_set,
+    servo_files,
     with_grippers,
 )
 from marl_handover.hardware.clock import Clock, RealClock
@@ -84,15 +84,15 @@ def open_devices(config: WorkcellConfig, model: CellModel, motion: MotionConfig,
     """The twin, if ``config`` is one; else the camera that is there, and ``confirm`` is asked before first moves.
 
     Raises:
-        InvalidSetting, UnknownChoice: a setting is out of its limits.
+        InvalidSetting, UnknownChoice: a setting is out of its limits, or an arm of the cell is not wired.
         NoCamera: the camera is not there.
     """
-    config.validate()
+    config.validate(model.cell.names)
     if config.emulated:
         twin = Twin(model, motion, config)
         return Devices(twin.hardware, twin.camera, twin.clock, twin.confirm, twin)
     clock = RealClock()
-    return Devices(config.hardware, open_camera(config.camera, clock=clock.now_s), clock, confirm)
+    return Devices(config.hardware.for_arms(model.cell.names), open_camera(config.camera, clock=clock.now_s), clock, confirm)
 
 
 def open_workcell(
@@ -111,15 +111,13 @@ def open_workcell(
     Raises:
         MissingFile, CorruptFile, CalibrationProblem, CalibrationMismatch: ``calibrate`` has to be run first, or again.
         NoCamera: the camera is not there.
-        InvalidSetting, UnknownChoice: a setting is out of its limits.
-        TwoArmsOnly: the cell has another number of arms.
+        InvalidSetting, UnknownChoice: a setting is out of its limits, or an arm of the cell is not wired.
     """
-    model.cell.require_pair("the hardware driver")
+    wired = config.hardware.for_arms(model.cell.names)
     folder = config.folder()
     seen_by = camera_calibration(folder)
-    own = [arm_file(arm) for arm in ARMS if not (arm in config.hardware.arms and config.hardware.arms[arm].calibration)]
-    require_one_set(folder, [*own, BACKLASH_FILE])
-    half_us = load_backlash(folder)
+    require_one_set(folder, [*(arm_file(arm) for arm, wiring in wired.arms.items() if not wiring.calibration), BACKLASH_FILE])
+    half_us = load_backlash(folder, tuple(wired.arms))
     devices = open_devices(config, model, motion, confirm)
     try:
         hardware = calibrated(devices.hardware, folder)
@@ -137,9 +135,9 @@ def open_workcell(
     return Workcell(config, driver, devices.camera, pose_monitor, half_band_rad, devices.clock, log, devices.twin)
 
 
-def is_calibrated(folder: Path) -> bool:
-    """Whether every file that ``calibrate`` writes is in ``folder``."""
-    return all((folder / name).is_file() for name in (CAMERA_FILE, SET_FILE, *SERVO_FILES))
+def is_calibrated(folder: Path, arms: Sequence[str] = ARMS) -> bool:
+    """Whether every file that ``calibrate`` writes of ``arms`` is in ``folder``."""
+    return all((folder / name).is_file() for name in (CAMERA_FILE, SET_FILE, *servo_files(arms)))
 
 
 def camera_calibration(folder: Path) -> CameraCalibration:
@@ -155,6 +153,5 @@ def calibrated(hardware: HardwareConfig, folder: Path) -> HardwareConfig:
     arms = {
         name: wiring if wiring.calibration else replace(wiring, calibration=str(folder / arm_file(name)))
         for name, wiring in hardware.arms.items()
-        if name in ARMS
     }
     return replace(hardware, arms=arms)

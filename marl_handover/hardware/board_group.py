@@ -1,4 +1,4 @@
-"""The boards of a cell, one or two, as one thing: joints and fingers to channels and pulses, and what is read back from them."""
+"""The boards of a cell, one or more, as one thing: joints and fingers to channels and pulses, and what is read back from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from marl_handover.hardware.calibration import ArmCalibration
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.errors import BadCommand, BoardReset, PortLost, TooSlow, WrongState
 from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason
-from marl_handover.hardware.settings import ARMS, PULSE_US, READING_US, SPEED_US_S, TIME_MS, GripperConfig, HardwareConfig
+from marl_handover.hardware.settings import PULSE_US, READING_US, SPEED_US_S, TIME_MS, GripperConfig, HardwareConfig
 from marl_handover.hardware.ssc32 import LineRecord, Ssc32, group_move, stop
 from marl_handover.hardware.transport import BITS_PER_BYTE
 
@@ -24,7 +24,7 @@ class Wiring:
     """Translates for all arms of a cell.
 
     Args:
-        config: electronics.
+        config: electronics, wired for the cell's arms alone.
         calibrations: of the arms, in order.
         pin_diameter_mm: of what the fingers close on.
         speed_rad_s: (5,) no joint may be faster, whatever a group move's time says: boards hold each servo to it.
@@ -33,9 +33,9 @@ class Wiring:
     def __init__(
         self, config: HardwareConfig, calibrations: Sequence[ArmCalibration], pin_diameter_mm: float, speed_rad_s: NDArray[np.float64]
     ) -> None:
-        self._config, self._calibrations, self._pin_mm = config, tuple(calibrations), pin_diameter_mm
+        self._config, self._calibrations, self._pin_mm, self._names = config, tuple(calibrations), pin_diameter_mm, tuple(config.arms)
         self._speeds: dict[tuple[str, int], int] = {}
-        for name, calibration in zip(ARMS, self._calibrations, strict=True):
+        for name, calibration in zip(self._names, self._calibrations, strict=True):
             board, gripper = config.arms[name].board, config.arms[name].gripper
             per_rad = [servo.least_us_per_rad() for servo in calibration.maps]
             speeds = [*(speed_rad_s * per_rad), config.gate.finger_mm_s * abs(gripper.open_us - gripper.closed_us) / gripper.open_mm]
@@ -44,13 +44,14 @@ class Wiring:
 
     def boards(self, arms: Iterable[int]) -> tuple[str, ...]:
         """Names of the boards that arms are wired to, each once."""
-        return tuple(dict.fromkeys(self._config.arms[ARMS[arm]].board for arm in arms if arm in range(len(ARMS))))
+        names = self._names
+        return tuple(dict.fromkeys(self._config.arms[names[arm]].board for arm in arms if arm in range(len(names))))
 
     def pulses(self, commands: Sequence[JointCommand]) -> dict[str, dict[int, int]]:
         """Board -> channel -> pulse in us. Raises :class:`BadCommand` for what is no number."""
         found: dict[str, dict[int, int]] = {}
         for command in commands:
-            name = ARMS[command.arm]
+            name = self._names[command.arm]
             pulses = self._calibrations[command.arm].to_us(command.joints_rad)
             if not (np.isfinite(pulses).all() and math.isfinite(command.gripper_mm)):
                 raise BadCommand("joints_rad", np.asarray(command.joints_rad).tolist(), "finite numbers")
@@ -65,7 +66,7 @@ class Wiring:
 
     def state(self, pulses_us: Mapping[str, Mapping[int, float]], arm: int) -> tuple[Floats, float]:
         """Joints (5,) and fingers that the pulses of an arm's channels stand for."""
-        name = ARMS[arm]
+        name = self._names[arm]
         found = pulses_us[self._config.arms[name].board]
         *joints, gripper = (found[channel] for channel in self._config.channels(name))
         return self._calibrations[arm].to_rad(np.array(joints, float)), finger_mm(self._config.arms[name].gripper, gripper)
@@ -86,7 +87,7 @@ def finger_mm(gripper: GripperConfig, pulse_us: float) -> float:
 
 def board_channels(config: HardwareConfig, board: str) -> list[int]:
     """Every channel of a board that an arm is wired to."""
-    return [channel for arm in ARMS if config.arms[arm].board == board for channel in config.channels(arm)]
+    return [channel for arm, wiring in config.arms.items() if wiring.board == board for channel in config.channels(arm)]
 
 
 Pulses = Mapping[str, Mapping[int, int | None]]
@@ -127,7 +128,8 @@ def readback_state(
     Raises :class:`CommandRejected` if it is held outside its limits, whatever its readings stand for: another cell's settings, or a
     calibration that is not this arm's. From there nobody knows the way.
     """
-    name = ARMS[arm]
+    names = tuple(config.arms)
+    name = names[arm]
     found = pulses[config.arms[name].board]
     *readings, gripper = (float(found[channel] or 0) for channel in config.channels(name))
     lower, upper = arm_model.lower_rad, arm_model.upper_rad
@@ -138,11 +140,11 @@ def readback_state(
         index = int(np.argmax(outside))
         limit = f"{math.degrees(lower[index]):.2f} to {math.degrees(upper[index]):.2f} degrees; let the arms go limp and put them there"
         what = f"{ARM_JOINTS[index]}, as the board holds it,"
-        raise CommandRejected(Reason.JOINT_LIMIT, arm, what, math.degrees(float(ends[:, index].mean())), limit)
+        raise CommandRejected(Reason.JOINT_LIMIT, arm, what, math.degrees(float(ends[:, index].mean())), limit, names)
     shut, wide = sorted(finger_mm(config.arms[name].gripper, gripper + more) for more in (0, READING_US))
     if wide < 0.0 or shut > config.gate.finger_mm:
         limit = f"0 to {config.gate.finger_mm:g} mm"
-        raise CommandRejected(Reason.GRIPPER, arm, "the opening of each finger, as the board holds it,", (shut + wide) / 2, limit)
+        raise CommandRejected(Reason.GRIPPER, arm, "the opening of each finger, as the board holds it,", (shut + wide) / 2, limit, names)
     fingers = min(max((shut + wide) / 2, 0.0), config.gate.finger_mm)
     return np.clip(calibrations[arm].to_rad(low + READING_US / 2), lower, upper), fingers
 

@@ -167,7 +167,7 @@ class ArmCalibration:
 
 
 def make_calibration(arm: str, model: ArmModel, points: Mapping[str, Sequence[tuple[float, float]]], fit: str = "line") -> ArmCalibration:
-    """The calibration of an arm (``left`` or ``right``) from measured points (pulse [us], angle [rad]) of each joint, dated now."""
+    """The calibration of an arm, by its name in the settings, from measured points (pulse [us], angle [rad]) of each joint, dated now."""
     _require_joints(arm, points)
     maps = tuple(ServoMap(f"{arm} {joint}", points[joint], fit) for joint in ARM_JOINTS)
     return ArmCalibration(arm, model.description.name, maps, _limits(model), time.time())
@@ -226,7 +226,7 @@ def _stored(what: str, path: Path, version: int, again: str = "") -> Iterator[di
 
 
 def calibrations(config: HardwareConfig, model: ArmModel) -> tuple[ArmCalibration, ...]:
-    """The calibration of every arm: its file's, or the nominal one where the settings name none.
+    """The calibration of every arm of ``config``, in order: its file's, or the nominal one where the settings name none.
 
     Raises:
         UnsupportedKinematics: the arm has other joints or another hand than the servos are wired for.
@@ -238,10 +238,8 @@ def calibrations(config: HardwareConfig, model: ArmModel) -> tuple[ArmCalibratio
         problem = f"hardware and twin have servos for five joints and two fingers, but this robot lacks {missing}; use backend=bullet"
         raise UnsupportedKinematics(description.path, problem)
     return tuple(
-        load_calibration(config.arms[arm].calibration, arm, model)
-        if config.arms[arm].calibration
-        else nominal_calibration(config, arm, model)
-        for arm in ARMS
+        load_calibration(wiring.calibration, arm, model) if wiring.calibration else nominal_calibration(config, arm, model)
+        for arm, wiring in config.arms.items()
     )
 
 
@@ -264,29 +262,29 @@ def _interpolate(x: Floats, xs: Floats, ys: Floats) -> Floats:
 
 
 def half_bands_rad(half_us: Mapping[str, ArrayLike], calibrations: Sequence[ArmCalibration]) -> Floats:
-    """(num_arms, 5) in rad of half dead bands (5,) given in us, arm by arm."""
+    """(num_arms, 5) in rad of half dead bands (5,) given in us, by arm; ``calibrations`` are in the order of the arms."""
     scales = np.array([[servo.us_per_rad() for servo in calibration.maps] for calibration in calibrations])
-    return np.array([half_us[arm] for arm in ARMS], float) / scales
+    return np.array([half_us[calibration.arm] for calibration in calibrations], float) / scales
 
 
 def backlash_text(half_us: Mapping[str, ArrayLike], sd_us: Mapping[str, ArrayLike]) -> str:
     """What the file holds: half the dead bands (5,) in us of each arm's servos, and their standard deviations (5,)."""
 
     def listed(values: Mapping[str, ArrayLike]) -> dict[str, dict[str, float]]:
-        rows = {arm: np.round(np.asarray(values[arm], float), 3).tolist() for arm in ARMS}
+        rows = {arm: np.round(np.asarray(each, float), 3).tolist() for arm, each in values.items()}
         return {arm: dict(zip(ARM_JOINTS, row, strict=True)) for arm, row in rows.items()}
 
     content = {"version": BACKLASH_VERSION, "half_band_us": listed(half_us), "half_band_sd_us": listed(sd_us)}
     return json.dumps(content, indent=1) + "\n"
 
 
-def load_backlash(folder: Path) -> dict[str, Floats]:
-    """Half the dead bands (5,) in us, by arm. Raises :class:`MissingFile`, :class:`CorruptFile` or :class:`InvalidSetting`."""
+def load_backlash(folder: Path, arms: Sequence[str] = ARMS) -> dict[str, Floats]:
+    """Half the dead bands (5,) in us, by arm, of ``arms``. Raises :class:`MissingFile`, :class:`CorruptFile` or :class:`InvalidSetting`."""
     path = folder / BACKLASH_FILE
     if not path.is_file():
         raise MissingFile("backlash of the servos", path, _SERVOS_AGAIN)
     with _stored("backlash of the servos", path, BACKLASH_VERSION, f", a band for each joint; {_SERVOS_AGAIN}") as content:
-        found = {arm: np.array([float(content["half_band_us"][arm][joint]) for joint in ARM_JOINTS]) for arm in ARMS}
+        found = {arm: np.array([float(content["half_band_us"][arm][joint]) for joint in ARM_JOINTS]) for arm in arms}
         for arm, values in found.items():
             for joint, value in zip(ARM_JOINTS, values, strict=True):
                 require_between(f"half_band_us.{arm}.{joint}", float(value), 0.0, MOST_US)
@@ -298,7 +296,12 @@ def arm_file(arm: str) -> str:
     return f"{arm}.json"
 
 
-SERVO_FILES = (*(arm_file(arm) for arm in ARMS), BACKLASH_FILE)
+def servo_files(arms: Sequence[str] = ARMS) -> tuple[str, ...]:
+    """The names of all that ``calibrate what=servos`` finds of ``arms``."""
+    return (*(arm_file(arm) for arm in arms), BACKLASH_FILE)
+
+
+SERVO_FILES = servo_files()
 
 
 def save_servos(folder: Path, arms: Mapping[str, ArmCalibration], half_us: Mapping[str, ArrayLike], sd_us: Mapping[str, ArrayLike]) -> None:
@@ -314,8 +317,8 @@ def save_servos(folder: Path, arms: Mapping[str, ArmCalibration], half_us: Mappi
         CannotWrite: there is no room for them, and then those that were there stay.
     """
     make_folder(folder)
-    texts = {arm_file(arm): arms[arm].text() for arm in ARMS} | {BACKLASH_FILE: backlash_text(half_us, sd_us)}
-    digests = {name: hashlib.sha256(texts[name].encode()).hexdigest() for name in SERVO_FILES}
+    texts = {arm_file(arm): found.text() for arm, found in arms.items()} | {BACKLASH_FILE: backlash_text(half_us, sd_us)}
+    digests = {name: hashlib.sha256(texts[name].encode()).hexdigest() for name in servo_files(tuple(arms))}
     texts[SET_FILE] = json.dumps({"version": _SET_VERSION, "sha256": digests}, indent=1) + "\n"
     for name in texts:
         keep(folder / name)
@@ -365,7 +368,7 @@ def save_grippers(folder: Path, asked: Mapping[str, GripperConfig], found: Mappi
         CannotWrite: there is no room, or no folder.
     """
     path = folder / GRIPPERS_FILE
-    arms = {arm: {"settings": _picked(asked[arm], _GRIPPERS_ASKED), "found": _picked(found[arm], _GRIPPERS_FOUND)} for arm in ARMS}
+    arms = {arm: {"settings": _picked(asked[arm], _GRIPPERS_ASKED), "found": _picked(found[arm], _GRIPPERS_FOUND)} for arm in found}
     content = {"version": _GRIPPERS_VERSION, "measured_unix_s": time.time(), "arms": arms}
     keep(path)
     write_whole(path, json.dumps(content, indent=1) + "\n")
@@ -383,10 +386,10 @@ def with_grippers(hardware: HardwareConfig, folder: Path) -> HardwareConfig:
     if not path.is_file():
         return hardware
     with _stored("gripper calibration", path, _GRIPPERS_VERSION, f"; {_GRIPPERS_AGAIN}") as content:
-        asked = {arm: {name: float(content["arms"][arm]["settings"][name]) for name in _GRIPPERS_ASKED} for arm in ARMS}
-        found = {arm: {name: int(content["arms"][arm]["found"][name]) for name in _GRIPPERS_FOUND} for arm in ARMS}
-    for arm in ARMS:
-        now = _picked(hardware.arms[arm].gripper, _GRIPPERS_ASKED)
+        asked = {arm: {name: float(content["arms"][arm]["settings"][name]) for name in _GRIPPERS_ASKED} for arm in hardware.arms}
+        found = {arm: {name: int(content["arms"][arm]["found"][name]) for name in _GRIPPERS_FOUND} for arm in hardware.arms}
+    for arm, wiring in hardware.arms.items():
+        now = _picked(wiring.gripper, _GRIPPERS_ASKED)
         if now != asked[arm]:
             raise CalibrationProblem(f"the {arm} gripper", f"{path} was found for {asked[arm]}, the settings say {now}; {_GRIPPERS_AGAIN}")
         if not all(PULSE_US[0] <= pulse <= PULSE_US[1] for pulse in found[arm].values()):

@@ -20,7 +20,7 @@ from marl_handover.hardware.clock import Clock, RealClock
 from marl_handover.hardware.errors import BoardReset, DeviceError, PortLost, PulseMismatch, Stopped, WrongState
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.safety_filter import JointCommand, SafetyFilter
-from marl_handover.hardware.settings import ARMS, HardwareConfig
+from marl_handover.hardware.settings import HardwareConfig
 
 LOG = logging.getLogger(__name__)
 FILTER_OFF = (
@@ -60,6 +60,7 @@ class ArmConnection:
         dry_run: bool = False,
     ) -> None:
         config.validate()
+        config = config.for_arms(model.cell.names)
         config.require_grip(model.cell.config.block.pin_diameter_mm)
         self.config, self.model, self.motion = config, model, motion or MotionConfig()
         model.cell.require_grip(self.motion.finger_travel_mm)
@@ -276,7 +277,7 @@ class ArmConnection:
         """
         require_held(pulses)
         self.boards.note_readback(pulses)
-        held = [readback_state(self.config, self.calibrations, self.model.arm, pulses, arm) for arm in range(len(ARMS))]
+        held = [readback_state(self.config, self.calibrations, self.model.arm, pulses, arm) for arm in range(len(self.config.arms))]
         stay = [JointCommand(arm, joints, fingers) for arm, (joints, fingers) in enumerate(held)]
         for command in stay:
             self.safety_filter.refer(*command)

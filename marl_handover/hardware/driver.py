@@ -1,4 +1,4 @@
-"""Both arms over one board or two: connect, arm, move, park, disconnect. Every move passes the safety filter and the latched stop.
+"""A cell's arms over one board or more: connect, arm, move, park, disconnect. Every move passes the safety filter and the latched stop.
 
     with ArmDriver(config, model, confirm=ask) as driver:  # connects and configures
         driver.arm()
@@ -30,7 +30,7 @@ from marl_handover.hardware.errors import BadCommand, HalfHeld, NotConfirmed, Wr
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.expected_pulses import SETTLED_S
 from marl_handover.hardware.safety_filter import JointCommand
-from marl_handover.hardware.settings import ARMS, HardwareConfig
+from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.hardware.ssc32 import LineRecord
 from marl_handover.motion.home import parked_poses
 
@@ -51,7 +51,7 @@ _LET_GO = (
     "A board has forgotten some servos while others are held. All will be let go: the arms sink. Are hands under them, or may they sink?"
 )
 _JUMP = (
-    "A board does not know where its arms are: its first move is a jump at full speed. Are both arms standing in the parked pose, "
+    "A board does not know where its arms are: its first move is a jump at full speed. Are {} arms standing in the parked pose, "
     "upright and drawn in, with the table free and a hand at the power switch?"
 )
 _NOMINAL = " NOT CALIBRATED: {}. With a horn one tooth off, 15 degrees, an arm jumps by that much: stay clear until it has moved."
@@ -123,11 +123,12 @@ class ArmDriver(ArmConnection):
         """
         if self.state not in (State.CONFIGURED, State.ARMED):
             raise WrongState("arm", self.state, State.CONFIGURED)
-        commands = [JointCommand(arm, self.parked_rad, self.motion.finger_travel_mm) for arm in range(len(ARMS))]
+        commands = [JointCommand(arm, self.parked_rad, self.motion.finger_travel_mm) for arm in range(len(self.config.arms))]
         with self._arming():
             self.safety_filter.check_stand(commands)
             pulses = self._all_or_none()
-            self._ask((_DRIVE if all_held(pulses) else _JUMP) + self._warning())
+            jump = _JUMP.format("both" if len(commands) == 2 else f"all {len(commands)}")
+            self._ask((_DRIVE if all_held(pulses) else jump) + self._warning())
             sent = self._jump(commands) if none_held(pulses) else self._drive_parked(commands)
             if not self.dry_run:
                 self.check_pulses()
@@ -152,7 +153,7 @@ class ArmDriver(ArmConnection):
     def joints_rad(self) -> Floats:
         """Where the arms have been sent to by now: (num_arms, 5); NaN for arms whose position is not known. Servos say nothing."""
         now_s = self.clock.now_s()
-        rows = [None if self._safety_filter is None else self._safety_filter.held(arm, now_s) for arm in range(len(ARMS))]
+        rows = [None if self._safety_filter is None else self._safety_filter.held(arm, now_s) for arm in range(len(self.config.arms))]
         return np.array([np.full(5, np.nan) if row is None else row[0] for row in rows])
 
     def gripper_mm(self, arm: int) -> float:
@@ -187,7 +188,7 @@ class ArmDriver(ArmConnection):
 
         The safety filter watches table and arms, but knows nothing of a block in the way: it is for leaving, not for handing over.
         """
-        for arm in range(len(ARMS)):
+        for arm in range(len(self.config.arms)):
             self.drive(arm, self.parked_rad, self.gripper_mm(arm), self.config.park_deg_s)
 
     def _drive(self, commands: Sequence[JointCommand], speed_deg_s: float, needs: State) -> MoveRecord:
@@ -292,7 +293,7 @@ class ArmDriver(ArmConnection):
     def _drive_parked(self, commands: Sequence[JointCommand]) -> MoveRecord:
         """From where the boards hold the arms, in short moves that the safety filter sees, after a look at the whole ways.
 
-        Each arm's against all of the other's: boards do not tell when a servo is stuck, and then one arm moves by itself.
+        Each arm's against all of every other's: boards do not tell when a servo is stuck, and then one arm moves by itself.
         """
         self._restate()
         self.safety_filter.check_room(

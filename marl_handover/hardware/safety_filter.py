@@ -59,12 +59,12 @@ class Reason(enum.StrEnum):
 
 
 class CommandRejected(WorkFailed):
-    """A command that is not sent. ``value`` and ``limit`` are in the units of the message."""
+    """A command that is not sent. ``value`` and ``limit`` are in the units of the message; ``names`` are those of the cell's arms."""
 
-    def __init__(self, reason: Reason, arm: int | None, what: str, value: Any, limit: str) -> None:
+    def __init__(self, reason: Reason, arm: int | None, what: str, value: Any, limit: str, names: Sequence[str] = ARMS) -> None:
         self.reason, self.arm, self.what, self.value, self.limit = reason, arm, what, value, limit
         shown = f"{value:.2f}" if isinstance(value, float) else value
-        whose = "" if arm is None else f"arm {ARMS[arm] if arm in range(len(ARMS)) else arm}, "
+        whose = "" if arm is None else f"arm {names[arm] if arm in range(len(names)) else arm}, "
         super().__init__(f"safety filter ({reason}): {whose}{what} is {shown}; allowed: {limit}")
 
 
@@ -105,17 +105,17 @@ class SafetyFilter:
 
     Args:
         model: geometry and joint limits.
-        config: limits, and the pulse limits of the wiring.
+        config: limits, and the pulse limits of the wiring, that of the cell's arms alone.
         calibrations: of the arms, in order.
     """
 
     def __init__(self, model: CellModel, config: HardwareConfig, calibrations: Sequence[ArmCalibration]) -> None:
-        self.limits, self.calibrations = config.gate, tuple(calibrations)
+        self.limits, self.calibrations, self.names = config.gate, tuple(calibrations), tuple(config.arms)
         self._arm, self._shapes = model.arm, (arm_shapes(model), arm_shapes(model, holding=True))
         self._closed_mm = model.cell.config.block.pin_diameter_mm / 2 + GRASP_MM
         self._least_mm = np.array([self.limits.table_clearance_mm, self.limits.self_clearance_mm, -self.limits.block_dip_mm])
         self._bases = [np.array([base.x_mm, base.y_mm, base.facing_rad]) for base in model.cell.bases]
-        self._pulses = [np.array(config.arms[name].pulse_limits_us, float) for name in ARMS]
+        self._pulses = [np.array(wiring.pulse_limits_us, float) for wiring in config.arms.values()]
         speeds = [model.arm.description.joint(name).velocity for name in ARM_JOINTS]
         self.speed_rad_s = config.gate.speed_share * np.array(speeds)
         self._speed = np.append(self.speed_rad_s, config.gate.finger_mm_s)
@@ -160,7 +160,7 @@ class SafetyFilter:
         for arm, target in targets.items():
             held = self._held[arm]
             if held is None:
-                raise CommandRejected(Reason.NO_REFERENCE, arm, "its position", "unknown", "an arm that was armed in its parked pose")
+                raise self._rejected(Reason.NO_REFERENCE, arm, "its position", "unknown", "an arm that was armed in its parked pose")
             self._check_ends(arm, target)
             self._check_way(arm, np.abs(target - held.at(now_s)), duration_s)
         self.check_room(targets, now_s)
@@ -205,19 +205,19 @@ class SafetyFilter:
     def _check_times(self, duration_s: float, now_s: float, made_s: float) -> None:
         for name, value in (("the duration", duration_s), ("when it was made", made_s)):
             if not _is(value, Real):
-                raise CommandRejected(Reason.SHAPE, None, name, repr(value), "a number of seconds")
+                raise self._rejected(Reason.SHAPE, None, name, repr(value), "a number of seconds")
         if not (math.isfinite(duration_s) and 0.0 < duration_s <= 60.0):
-            raise CommandRejected(Reason.DURATION, None, "the duration", duration_s, "above 0 and up to 60 s")
+            raise self._rejected(Reason.DURATION, None, "the duration", duration_s, "above 0 and up to 60 s")
         age_s = now_s - made_s
         if self.limits.enabled and not -_ROUNDING <= age_s <= self.limits.stale_s:
-            raise CommandRejected(Reason.STALE, None, "its age", age_s, f"0 to {self.limits.stale_s:g} s")
+            raise self._rejected(Reason.STALE, None, "its age", age_s, f"0 to {self.limits.stale_s:g} s")
 
     def _targets(self, commands: Sequence[JointCommand]) -> dict[int, Floats]:
         """Joints and fingers (6,) by arm."""
         found = [self.target(command) for command in commands]
         targets = {int(command.arm): target for command, target in zip(commands, found, strict=True)}
         if not commands or len(targets) != len(commands):
-            raise CommandRejected(
+            raise self._rejected(
                 Reason.SHAPE, None, "arms of the command", [command.arm for command in commands], "each at most once, at least one"
             )
         return targets
@@ -225,17 +225,17 @@ class SafetyFilter:
     def target(self, command: JointCommand) -> Floats:
         """Joints and fingers (6,) of a command. Raises :class:`CommandRejected` if it has not the form of one, or is not finite."""
         if not _is(command.arm, Integral) or command.arm not in range(len(self._held)):
-            raise CommandRejected(Reason.SHAPE, None, "the arm", repr(command.arm), f"0 to {len(self._held) - 1}")
+            raise self._rejected(Reason.SHAPE, None, "the arm", repr(command.arm), f"0 to {len(self._held) - 1}")
         try:
             target = np.append(np.asarray(command.joints_rad, float), float(command.gripper_mm))
         except (TypeError, ValueError):
             target = np.zeros(0)
         if target.shape != (6,) or np.ndim(command.joints_rad) != 1:
-            raise CommandRejected(
+            raise self._rejected(
                 Reason.SHAPE, command.arm, "the command", np.shape(command.joints_rad), "five angles, and a number for the fingers"
             )
         if not np.isfinite(target).all():
-            raise CommandRejected(Reason.NOT_FINITE, command.arm, "the command", target.tolist(), "finite numbers")
+            raise self._rejected(Reason.NOT_FINITE, command.arm, "the command", target.tolist(), "finite numbers")
         return target
 
     def _check_ends(self, arm: int, target: Floats) -> None:
@@ -245,12 +245,12 @@ class SafetyFilter:
             angle = float(target[index])
             if not lower[index] - LIMIT_TOLERANCE_RAD <= angle <= upper[index] + LIMIT_TOLERANCE_RAD:
                 limit = f"{math.degrees(lower[index]):.2f} to {math.degrees(upper[index]):.2f} degrees"
-                raise CommandRejected(Reason.JOINT_LIMIT, arm, joint, math.degrees(angle), limit)
+                raise self._rejected(Reason.JOINT_LIMIT, arm, joint, math.degrees(angle), limit)
         if not 0.0 <= target[5] <= self.limits.finger_mm:
-            raise CommandRejected(Reason.GRIPPER, arm, "the opening of each finger", float(target[5]), f"0 to {self.limits.finger_mm:g} mm")
+            raise self._rejected(Reason.GRIPPER, arm, "the opening of each finger", float(target[5]), f"0 to {self.limits.finger_mm:g} mm")
         for joint, pulse, (low, high) in zip(ARM_JOINTS, np.rint(self.calibrations[arm].to_us(target[:5])), self._pulses[arm], strict=True):
             if not low <= pulse <= high:
-                raise CommandRejected(Reason.PULSE_LIMIT, arm, f"the pulse of {joint}", float(pulse), f"{low:g} to {high:g} us")
+                raise self._rejected(Reason.PULSE_LIMIT, arm, f"the pulse of {joint}", float(pulse), f"{low:g} to {high:g} us")
 
     def _check_way(self, arm: int, change: Floats, duration_s: float) -> None:
         """Whether an arm may change so much, joints and fingers (6,), in one command."""
@@ -258,29 +258,32 @@ class SafetyFilter:
         widest = int(np.argmax(change[:5]))
         if change[widest] > step_rad + _ROUNDING:
             what = f"the step of {ARM_JOINTS[widest]}"
-            raise CommandRejected(Reason.STEP, arm, what, math.degrees(change[widest]), f"up to {self.limits.step_deg:g} degrees")
+            raise self._rejected(Reason.STEP, arm, what, math.degrees(change[widest]), f"up to {self.limits.step_deg:g} degrees")
         over = change / duration_s - self._speed * (1 + _ROUNDING)
         worst = int(np.argmax(over / self._speed))
         if over[worst] > 0.0:
             speed, limit, unit = change[worst] / duration_s, self._speed[worst], "mm/s"
             if worst < 5:
                 speed, limit, unit = math.degrees(speed), math.degrees(limit), "degrees/s"
-            raise CommandRejected(Reason.SPEED, arm, f"the speed of {_ANGLES[worst]}", float(speed), f"up to {limit:.1f} {unit}")
+            raise self._rejected(Reason.SPEED, arm, f"the speed of {_ANGLES[worst]}", float(speed), f"up to {limit:.1f} {unit}")
 
     def _check_ways(self, ways: Sequence[Floats | None], commanded: Collection[int], together: bool) -> None:
         """Whether arms may go their ``ways`` (3, 6), None of one that is unknown; those that are ``commanded`` are judged."""
         for arm in commanded:
             own = ways[arm]
             if own is None:
-                raise CommandRejected(Reason.NO_REFERENCE, arm, "its position", "unknown", "an arm that was armed in its parked pose")
+                raise self._rejected(Reason.NO_REFERENCE, arm, "its position", "unknown", "an arm that was armed in its parked pose")
             self._check_alone(arm, own)
             for other, way in enumerate(ways):
                 if other == arm or (other in commanded and other < arm):
                     continue
                 if way is None:
                     limit = "arms that were all armed in their parked pose"
-                    raise CommandRejected(Reason.NO_REFERENCE, other, "its position", "unknown", limit)
+                    raise self._rejected(Reason.NO_REFERENCE, other, "its position", "unknown", limit)
                 self._check_pair(arm, own, other, way, together and other in commanded)
+
+    def _rejected(self, reason: Reason, arm: int | None, what: str, value: Any, limit: str) -> CommandRejected:
+        return CommandRejected(reason, arm, what, value, limit, self.names)
 
     def _holds(self, way: Floats) -> bool:
         """Whether a hand may hold the block anywhere on a way (3, 6)."""
@@ -296,15 +299,16 @@ class SafetyFilter:
         )
         for gap, least, (reason, what) in zip(gaps.tolist(), self._least_mm.tolist(), found, strict=True):
             if gap < least:
-                raise CommandRejected(reason, arm, what, gap, f"at least {least:g} mm")
+                raise self._rejected(reason, arm, what, gap, f"at least {least:g} mm")
 
     def _check_pair(self, arm: int, way: Floats, other: int, other_way: Floats, together: bool) -> None:
         holding, also, least = self._holds(way), self._holds(other_way), self.limits.arm_clearance_mm
         shapes, others = self._shapes[holding], self._shapes[also]
         gap = between_mm(way, other_way, together, shapes, others, self._bases[arm], self._bases[other], least)
         if gap < least:
-            what = f"the distance{_with_block(holding)} to the other arm{_with_block(also)} on the way"
-            raise CommandRejected(Reason.OTHER_ARM, arm, what, gap, f"at least {least:g} mm")
+            whom = "the other arm" if len(self.names) == 2 else f"arm {self.names[other]}"
+            what = f"the distance{_with_block(holding)} to {whom}{_with_block(also)} on the way"
+            raise self._rejected(Reason.OTHER_ARM, arm, what, gap, f"at least {least:g} mm")
 
 
 def _with_block(holding: bool) -> str:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 from marl_handover.config import bounded, check_bounds, chosen, name_field, path_field, seed_field
-from marl_handover.errors import InvalidSetting
+from marl_handover.errors import InvalidSetting, listed
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.session_registry import user_path
 
@@ -28,10 +29,13 @@ BAUDS = (115200, 38400, 9600, 2400)
 FIRST_MOVES = ("ask", "refuse")
 ON_DISCONNECT = ("hold", "limp", "park")
 TWIN = "twin"
-"""The name of hardware that is emulated, physics and camera included."""
+"""The name of hardware that is emulated, physics and camera included; so is every one whose name ends in ``_twin``."""
 
 ARMS = ("left", "right")
-"""Names of the arms in settings, by arm index."""
+"""Names of the arms of a pair, as it is wired if nothing is said."""
+_FILE_NAME, _OTHER_FILES = re.compile(r"[\w-]+"), ("camera", "grippers", "play", "servos")
+"""What an arm may be called, and what else is beside the files of the arms."""
+
 MAX_PARK_DEG_S = 90.0
 """Slow enough for a hand to get out of the way; servos can do 260."""
 
@@ -142,15 +146,28 @@ class EmulatorConfig:
     boot_s: float = bounded(0.2, 0.0, 30.0)
 
 
+def _pair() -> dict[str, ArmWiring]:
+    """Two arms on one board."""
+    return {"left": ArmWiring(), "right": ArmWiring(channels=[16, 17, 18, 19, 21], gripper=GripperConfig(channel=20))}
+
+
+def twin_of(name: str) -> str:
+    """The name of hardware ``name`` when it is emulated; of hardware that is, its own."""
+    if name == TWIN or name.endswith(f"_{TWIN}"):
+        return name
+    return TWIN if name == HardwareConfig().name else f"{name}_{TWIN}"
+
+
 @dataclass
 class HardwareConfig:
-    """The electronics of a cell. One board for both arms is the default; for two, name a second one in ``boards`` and in an arm."""
+    """The electronics of a cell. One board for a pair of arms is the default; for more boards, name them in ``boards`` and in the arms.
+
+    Arms are wired by their names in the cell. Once an arm of another name is wired, the pair's own wiring no longer counts.
+    """
 
     name: str = name_field("lynxmotion")  # its calibration is kept in a folder of this name
     boards: dict[str, BoardConfig] = field(default_factory=lambda: {"main": BoardConfig()})
-    arms: dict[str, ArmWiring] = field(
-        default_factory=lambda: {"left": ArmWiring(), "right": ArmWiring(channels=[16, 17, 18, 19, 21], gripper=GripperConfig(channel=20))}
-    )
+    arms: dict[str, ArmWiring] = field(default_factory=_pair)
     nominal: dict[str, ServoNominal] = field(default_factory=_nominal)
     gate: SafetyFilterConfig = field(default_factory=SafetyFilterConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)
@@ -167,34 +184,74 @@ class HardwareConfig:
         check_bounds(self, "hardware.")
         if self.stop_file and not os.path.isabs(self.stop_file):
             raise InvalidSetting("hardware.stop_file", self.stop_file, "an absolute path: every shell has to find the same file")
-        if set(self.arms) != set(ARMS):
-            raise InvalidSetting("hardware.arms", sorted(self.arms), f"wiring of {' and '.join(ARMS)}")
         if set(self.nominal) != set(ARM_JOINTS):
             raise InvalidSetting("hardware.nominal", sorted(self.nominal), f"a servo each for {', '.join(ARM_JOINTS)}")
-        for name in ARMS:
-            self._check_arm(f"hardware.arms.{name}", self.arms[name])
-        for name in self.used_boards():
-            baud = self.boards[name].baud
-            if baud not in BAUDS:
-                raise InvalidSetting(f"hardware.boards.{name}.baud", baud, f"one of {', '.join(map(str, BAUDS))}")
-            taken = [channel for arm in ARMS if self.arms[arm].board == name for channel in self.channels(arm)]
-            if len(set(taken)) != len(taken):
-                raise InvalidSetting(f"channels of board {name}", taken, "each used once")
+        self._check_plugs(self._meant())
         emulator = self.emulator
         if len(emulator.speed_deg_s) != len(ARM_JOINTS) + 1:
             raise InvalidSetting("hardware.emulator.speed_deg_s", emulator.speed_deg_s, f"{len(ARM_JOINTS) + 1} speeds")
         if not re.search(r"SSC32-V\d+\.\d+", emulator.firmware):
             raise InvalidSetting("hardware.emulator.firmware", emulator.firmware, "SSC32-V and a number, such as SSC32-V2.50USB")
 
+    @property
+    def emulated(self) -> bool:
+        """Whether these are electronics of a twin."""
+        return twin_of(self.name) == self.name
+
+    def for_arms(self, names: Sequence[str] | None = None) -> HardwareConfig:
+        """These settings with the wiring of some arms alone, in their order: the k-th of ``arms`` is arm k of the cell.
+
+        Args:
+            names: the cell's arms; two of which none is wired by its name are ``left`` and ``right``. None: all that the settings mean.
+
+        Raises:
+            InvalidSetting: an arm of the cell is not wired, one is wired that the cell has not, or two plugs are one.
+        """
+        meant = self._meant()
+        wanted = meant if names is None else tuple(names)
+        if len(wanted) == 2 and set(meant) == set(ARMS) and not set(wanted) & set(ARMS):
+            wanted = ARMS
+        if not set(wanted) <= set(self.arms) or not set(meant) <= set(wanted):
+            limit = f"wiring of the cell's arms, {listed(wanted)}, each by its name; hardware=FILE.yaml may hold it"
+            raise InvalidSetting("hardware.arms", sorted(meant), limit)
+        self._check_plugs(wanted)
+        return replace(self, arms={name: self.arms[name] for name in wanted})
+
     def require_grip(self, pin_diameter_mm: float) -> None:
         """Raise :class:`InvalidSetting` for fingers that would close to their end, whatever is between them: that strips gears."""
-        for name in ARMS:
-            preload_mm = self.arms[name].gripper.preload_mm
+        for name, wiring in self.arms.items():
+            preload_mm = wiring.gripper.preload_mm
             if preload_mm >= pin_diameter_mm / 2:
                 limit = f"below {pin_diameter_mm / 2:g}, half of cell.block.pin_diameter_mm: fingers never close to their end"
                 raise InvalidSetting(f"hardware.arms.{name}.gripper.preload_mm", preload_mm, limit)
 
+    def _meant(self) -> tuple[str, ...]:
+        """Names of the arms that are wired: the pair as it is shipped gives way to arms of other names."""
+        usual = _pair()
+        if set(self.arms) <= set(usual):
+            return tuple(name for name in usual if name in self.arms)
+        return tuple(name for name, wiring in self.arms.items() if usual.get(name) != wiring)
+
+    def _check_plugs(self, names: Sequence[str]) -> None:
+        """Raise :class:`InvalidSetting` for wiring of the arms ``names`` that cannot be."""
+        for name in names:
+            self._check_arm(f"hardware.arms.{name}", self.arms[name])
+        ports: dict[str, str] = {}
+        for board in dict.fromkeys(self.arms[name].board for name in names):
+            baud, port = self.boards[board].baud, self.boards[board].port
+            if baud not in BAUDS:
+                raise InvalidSetting(f"hardware.boards.{board}.baud", baud, f"one of {', '.join(map(str, BAUDS))}")
+            if port and port in ports:
+                raise InvalidSetting(f"hardware.boards.{board}.port", port, f"another port than that of board {ports[port]}")
+            ports[port] = board
+            taken = [channel for name in names if self.arms[name].board == board for channel in self.channels(name)]
+            if len(set(taken)) != len(taken):
+                raise InvalidSetting(f"channels of board {board}", taken, "each used once")
+
     def _check_arm(self, name: str, arm: ArmWiring) -> None:
+        if not _FILE_NAME.fullmatch(name.rpartition(".")[2]) or name.rpartition(".")[2] in _OTHER_FILES:
+            limit = f"a name of letters, digits, _ and -, and none of {', '.join(_OTHER_FILES)}: its calibration is a file of that name"
+            raise InvalidSetting("an arm of the hardware", name.rpartition(".")[2], limit)
         if arm.board not in self.boards:
             raise InvalidSetting(f"{name}.board", arm.board, f"one of hardware.boards: {', '.join(self.boards)}")
         if len(arm.channels) != len(ARM_JOINTS) or not all(0 <= channel < CHANNELS for channel in arm.channels):
@@ -208,7 +265,7 @@ class HardwareConfig:
 
     def used_boards(self) -> tuple[str, ...]:
         """Names of the boards that an arm is wired to, in the order of the arms."""
-        return tuple(dict.fromkeys(self.arms[arm].board for arm in ARMS))
+        return tuple(dict.fromkeys(wiring.board for wiring in self.arms.values()))
 
     def channels(self, arm: str) -> tuple[int, ...]:
         """An arm's channels, the gripper's last."""
@@ -219,4 +276,4 @@ class HardwareConfig:
 
         The twin has one of its own: what stops real arms does not keep it from moving, and the other way round.
         """
-        return self.stop_file or str(user_path(".twin.stop" if self.name == TWIN else ".stop"))
+        return self.stop_file or str(user_path(".twin.stop" if self.emulated else ".stop"))

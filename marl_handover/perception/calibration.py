@@ -18,7 +18,7 @@ from marl_handover.errors import CorruptFile, HandoverError, MissingFile, WorkFa
 from marl_handover.files import copy_whole, make_folder, write_whole
 from marl_handover.parsing import read_json
 from marl_handover.perception.printables import board_corners_mm, charuco_board
-from marl_handover.perception.settings import BoardConfig, MountConfig
+from marl_handover.perception.settings import USUAL_EYE_MM, BoardConfig, MountConfig
 
 Pixels = NDArray[np.uint8]
 
@@ -274,4 +274,4 @@ def hung_camera(mount: MountConfig, size_px: tuple[int, int]) -> CameraCalibrati
     """The truth about a rendered camera: what calibrating it should come out at."""
     mount.validate()
     lens = Intrinsics.pinhole(mount.focal_px, size_px)
-    return CameraCalibration(lens, looking_down(mount.eye_mm, mount.tilt_deg, mount.turn_deg))
+    return CameraCalibration(lens, looking_down(USUAL_EYE_MM if mount.eye_mm is None else mount.eye_mm, mount.tilt_deg, mount.turn_deg))

@@ -110,11 +110,14 @@ class TrackerConfig:
         check_bounds(self, "tracker.")
 
 
+USUAL_EYE_MM = (3.0, -4.0, 702.0)
+
+
 @dataclass
 class MountConfig:
     """How a rendered camera truly hangs: 700 mm above the table, as centred and as straight as a mechanic gets it."""
 
-    eye_mm: list[float] = bounded([3.0, -4.0, 702.0], -5000.0, 5000.0, (3, 3))
+    eye_mm: list[float] | None = bounded(None, -5000.0, 5000.0, (3, 3))  # null: [3, -4, 702]; over more than two arms as high as it takes
     tilt_deg: list[float] = bounded([0.3, -0.2], -180.0, 180.0, (2, 2))  # about its own x and y axis
     turn_deg: float = bounded(0.4, -180.0, 180.0)  # about its line of sight; 0: world x is up in the picture, world y points left
     focal_px: float = bounded(917.0, 10.0, 1e5)
@@ -122,7 +125,8 @@ class MountConfig:
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` on a value out of its limits."""
         check_bounds(self, "mount.")
-        require_between("mount.eye_mm[2]", self.eye_mm[2], 100, 5000)
+        if self.eye_mm is not None:
+            require_between("mount.eye_mm[2]", self.eye_mm[2], 100, 5000)
 
 
 @dataclass

@@ -137,3 +137,26 @@ def test_the_command_serves_until_it_is_interrupted(tmp_path):
             process.kill()
     assert "#3P1234" in rest
     assert not link.is_symlink()
+
+
+def test_the_command_serves_every_board_of_three_arms(tmp_path):
+    """The first board at the link, the second beside it; each has the channels of its own arms and knows nothing of the other's."""
+    link = tmp_path / "ssc32"
+    arguments = [sys.executable, "-m", "marl_handover.cli", "emulate", "hardware=triangle", f"link={link}"]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"}) as process:
+        try:
+            assert f"at {link}," in process.stdout.readline()
+            assert f"at {link}_second," in process.stdout.readline()
+            boards = [Ssc32(name, BoardConfig(f"{link}{name}"), TimeoutConfig(reply_s=1.0), RealClock()) for name in ("", "_second")]
+            for number, board in enumerate(boards):
+                board.connect()
+                board.first_move({4: 1300 + 100 * number}, None)
+            assert [board.pulses([4]) for board in boards] == [{4: 1300}, {4: 1400}]
+            for board in boards:
+                board.close()
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(timeout=30) == 0
+        finally:
+            process.kill()
+    assert not link.is_symlink()
+    assert not (tmp_path / "ssc32_second").is_symlink()

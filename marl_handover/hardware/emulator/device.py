@@ -20,7 +20,7 @@ from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.emulator.board import FRAME_S, EmulatedBoard, Servo, ServoTruth
-from marl_handover.hardware.settings import ARMS, HardwareConfig
+from marl_handover.hardware.settings import HardwareConfig
 
 KINDS = {
     "unplug": "the USB cable is out",
@@ -272,7 +272,7 @@ class EmulatedCell:
     """Boards and servos as the settings wire them, each servo with a scale, an offset and a dead band of its own, drawn from the seed.
 
     Args:
-        config: the electronics; ``config.emulator`` says what the servos are like.
+        config: the electronics, wired for the cell's arms alone; ``config.emulator`` says what the servos are like.
         arm: kinematics; their limits say where the end stops are.
         standing_rad: (5,) where the joints stand when nothing was ever switched on: whoever sets up a cell puts the arms there.
         gripper_mm: the same of the fingers.
@@ -282,7 +282,7 @@ class EmulatedCell:
         config.validate()
         self.config, self._arm = config, arm
         self._random = random.Random(config.emulator.seed)
-        self.truths = {name: self._drawn(name) for name in ARMS}
+        self.truths = {name: self._drawn(name) for name in config.arms}
         """Arm -> the five joints' servos as they truly are, then the gripper's."""
         servos: dict[str, dict[int, Servo]] = {name: {} for name in config.used_boards()}
         stand = [*(float(angle) for angle in np.asarray(standing_rad, float)), gripper_mm]
@@ -323,14 +323,14 @@ class EmulatedCell:
 
     def servos(self, arm: int) -> list[Servo]:
         """An arm's servos, the gripper's last."""
-        name = ARMS[arm]
+        name = tuple(self.config.arms)[arm]
         device = self.devices[self.config.arms[name].board]
         return [device.servos[channel] for channel in self.config.channels(name)]
 
     def _positions(self, t_s: float) -> Floats:
         for device in self.devices.values():
             device.advance(t_s)
-        return np.array([[servo.position for servo in self.servos(arm)] for arm in range(len(ARMS))])
+        return np.array([[servo.position for servo in self.servos(arm)] for arm in range(len(self.config.arms))])
 
     def _drawn(self, arm: str) -> list[ServoTruth]:
         """The servos of an arm."""

@@ -16,7 +16,8 @@ from marl_handover.hardware.clock import Clock, RealClock
 from marl_handover.hardware.emulator.device import EmulatedDevice
 
 _RATES = {getattr(termios, f"B{baud}"): baud for baud in (2400, 9600, 38400, 57600, 115200)}
-_IDLE_S = 0.02
+IDLE_S = 0.02
+"""So long a turn waits at most for something to do."""
 
 
 class PtyEmulator:
@@ -50,10 +51,10 @@ class PtyEmulator:
         while not until():
             self.turn()
 
-    def turn(self) -> None:
-        """Wait for the next thing to do, 20 ms at most, and do it."""
+    def turn(self, idle_s: float = IDLE_S) -> None:
+        """Wait for the next thing to do, ``idle_s`` at most, and do it."""
         next_s = self.device.next_event_s()
-        wait_s = _IDLE_S if next_s is None else min(_IDLE_S, max(0.0, next_s - self.now_s()))
+        wait_s = idle_s if next_s is None else min(idle_s, max(0.0, next_s - self.now_s()))
         if self._master >= 0:
             ready, _, _ = select.select([self._master], [], [], wait_s)
             data = os.read(self._master, 4096) if ready else b""
