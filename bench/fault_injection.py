@@ -200,7 +200,7 @@ class FaultInjector:
 
     def _anywhere(self) -> Floats:
         cell = self.rules.cell
-        reach = max(abs(base.y_mm) for base in cell.bases) + cell.r_max_mm
+        reach = max(cell.extent_mm)
         while True:
             at = self._random.uniform(-reach, reach, 2)
             if cell.reaches(at).any():

@@ -1,6 +1,7 @@
 """The twin in numbers: plain episodes, episodes with a mishap each, and a soak; through bytes and pixels, calibrated by `calibrate`.
 
 python bench/twin.py episodes=200 drills=200 soak=5000 robots=10 jobs=2 seed=0 noise=1 policy=pretrained_twin folder=runs/bench_twin
+python bench/twin.py cell=triangle hardware=triangle_twin policy=exact episodes=0 drills=50 robots=5 folder=runs/bench_triangle
 
 The episodes are spread over ``robots``: each has servos, camera, glue and paper of its own, drawn from ``seed``, and is calibrated by
 itself. ``noise`` multiplies everything that is drawn: dead bands, resting noise, scales, zeros, the cards' glue, the boards' laying, the
@@ -26,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from common import ROOT, commit, machine, parse, table
-from twin_work import Work, append, robot_changes, rows, work
+from twin_work import Work, append, robot_changes, rows, usual, work
 
 DEFAULTS = {
     "episodes": 200,
@@ -38,11 +39,13 @@ DEFAULTS = {
     "noise": 1.0,
     "policy": "pretrained_twin",
     "engine": "bullet",
+    "cell": "paper",
+    "hardware": "twin",
     "folder": "runs/bench_twin",
     "results": "bench/results",
 }
 BARS = {"first_time": 0.95, "in_the_end": 0.98, "drills": 0.95, "latency_ms": 150.0}
-_SAME = ("episodes", "drills", "soak", "robots", "seed", "noise", "policy", "engine")
+_SAME = ("episodes", "drills", "soak", "robots", "seed", "noise", "policy", "engine", "cell", "hardware")
 
 
 def claim(root: Path, values: dict[str, Any]) -> None:
@@ -167,7 +170,7 @@ def soaked(found: list[dict[str, Any]]) -> dict[str, Any]:
 
 def gathered(root: Path, values: dict[str, Any]) -> dict[str, Any]:
     """All results there are in ``root``."""
-    found: dict[str, Any] = {"robots": [robot_changes(values["seed"], n, values["noise"]) for n in range(values["robots"])]}
+    found: dict[str, Any] = {"robots": [robot_changes(values["seed"], n, values["noise"], usual(values)) for n in range(values["robots"])]}
     for part, summed in (("episode", plain), ("drill", drilled), ("soak", soaked)):
         every = [row for path in sorted(root.glob(f"robot_*/{part}.jsonl")) for row in rows(path)]
         if every:
@@ -216,7 +219,7 @@ def main(arguments: list[str]) -> None:
     target = ROOT / values["results"] / datetime.date.today().isoformat()
     target.mkdir(parents=True, exist_ok=True)
     about = {"settings": values, "commit": commit(), "machine": machine(values["jobs"]), "started": rows(root / "started.jsonl")}
-    other = {"noise": f"noise{values['noise']:g}", "engine": values["engine"]}
+    other = {"noise": f"noise{values['noise']:g}", "engine": values["engine"], "cell": values["cell"]}
     name = "_".join(["twin", *(word for key, word in other.items() if values[key] != DEFAULTS[key])]) + ".json"
     (target / name).write_text(json.dumps({**about, "wall_s": time.perf_counter() - begun, "bars": BARS, **found}, indent=1) + "\n")
     print(f"-> {target / name}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from marl_handover.control.twin import Twin
 from marl_handover.hardware.clearance import FAR_MM, alone_mm, arm_shapes, between_mm, still
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.emulator.board import FRAME_S
-from marl_handover.hardware.settings import ARMS
 
 Floats = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class LimitWatch:
         self._lower, self._upper = model.arm.lower_rad, model.arm.upper_rad
         self._shapes = arm_shapes(model)
         self._bases = [np.array([base.x_mm, base.y_mm, base.facing_rad]) for base in model.cell.bases]
-        self._pulses = [np.array(self._config.arms[name].pulse_limits_us, float) for name in ARMS]
+        self._pulses = [np.array(wiring.pulse_limits_us, float) for wiring in self._config.arms.values()]
         self._before: Floats | None = None
         self.violations: Counter[str] = Counter()
         self.worst: dict[str, float] = {}
@@ -77,8 +77,7 @@ class LimitWatch:
     def _sent_us(self, now_s: float) -> Floats:
         """(num_arms, 5)."""
         outputs = {name: device.outputs_us(now_s) for name, device in self._twin.electronics.devices.items()}
-        wirings = [self._config.arms[name] for name in ARMS]
-        return np.array([[outputs[wiring.board][channel] for channel in wiring.channels] for wiring in wirings])
+        return np.array([[outputs[wiring.board][channel] for channel in wiring.channels] for wiring in self._config.arms.values()])
 
     def _joints(self, sent_us: Floats, sent: Floats, true: Floats) -> None:
         for row, limits in zip(sent_us, self._pulses, strict=True):
@@ -93,8 +92,10 @@ class LimitWatch:
         for row in joints:
             alone_mm(still(row), self._shapes, np.full(3, FAR_MM), gaps)
             self._over(f"{what} plane, mm below", -float(gaps[0]), -table_mm)
-        gap = between_mm(still(joints[0]), still(joints[1]), True, self._shapes, self._shapes, *self._bases, FAR_MM)
-        self._over(f"{what} arm to arm, mm nearer", -gap, -apart_mm)
+        for one, other in combinations(range(len(joints)), 2):
+            ways, bases = (still(joints[one]), still(joints[other])), (self._bases[one], self._bases[other])
+            gap = between_mm(*ways, True, self._shapes, self._shapes, *bases, FAR_MM)
+            self._over(f"{what} arm to arm, mm nearer", -gap, -apart_mm)
 
     def _speed(self, speed_rad_s: Floats) -> None:
         self._over("sent speed, share", float((speed_rad_s / self._driver.safety_filter.speed_rad_s).max()), SPEED_SHARE)

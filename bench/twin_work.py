@@ -13,6 +13,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,16 +24,22 @@ from twin_limits import LimitWatch
 from marl_handover import policies
 from marl_handover.arrays import wrap
 from marl_handover.bounds import MAX_SEED
+from marl_handover.cell import build_cell, cell_config
 from marl_handover.cli import main as command_line
+from marl_handover.compose import from_yaml
 from marl_handover.control.closed_loop import ClosedLoop, make_loop
 from marl_handover.control.evaluation import true_outcome, truly_solved
 from marl_handover.control.events import FAULTS, Event
 from marl_handover.control.session import GivenGoal, Session
 from marl_handover.control.settings import WorkcellConfig, twin_workcell
 from marl_handover.control.transfers import Episode
+from marl_handover.control.twin import mount_over
 from marl_handover.control.workcell import is_calibrated
 from marl_handover.errors import WorkFailed
+from marl_handover.files import resource_path
+from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.learning.evaluation import random_problems
+from marl_handover.perception.settings import USUAL_EYE_MM
 from marl_handover.task.rules import Outcome, Rules
 
 HANG_WALL_S, HANG_VIRTUAL_S = 900.0, 600.0
@@ -57,14 +64,27 @@ class Work(NamedTuple):
     count: int
 
 
-def robot_changes(seed: int, robot: int, noise: float) -> dict[str, Any]:
-    """Settings of a robot: all its seeds, its camera as somebody hung it, its errors multiplied by ``noise``."""
+def usual(values: dict[str, Any]) -> WorkcellConfig:
+    """The twin of the bench's hardware as it is shipped, its camera over the middle of the bench's cell."""
+    config = WorkcellConfig(from_yaml(HardwareConfig, resource_path(f"configs/hardware/{values['hardware']}.yaml")))
+    config.mount = replace(config.mount, tilt_deg=[0.0, 0.0], turn_deg=0.0)
+    hung = mount_over(build_cell(cell_config(values["cell"])), config)
+    x, y, z = (0.0, 0.0, 700.0) if hung.eye_mm is None else np.subtract(hung.eye_mm, USUAL_EYE_MM) + (0.0, 0.0, 700.0)
+    config.mount = replace(hung, eye_mm=[float(x), float(y), float(z)])
+    return config
+
+
+def robot_changes(seed: int, robot: int, noise: float, config: WorkcellConfig | None = None) -> dict[str, Any]:
+    """Settings of a robot: all its seeds, its camera as somebody hung it, its errors multiplied by ``noise``.
+
+    ``config`` is the twin of which they are, as :func:`usual` gives it; None: of the shipped pair.
+    """
     random = np.random.default_rng([seed, robot])
-    drawn, config = int(random.integers(2**31)) % (MAX_SEED + 1), twin_workcell()
+    drawn, config = int(random.integers(2**31)) % (MAX_SEED + 1), config or usual({"cell": "paper", "hardware": "twin"})
     changes = {"hardware.emulator.seed": drawn, "twin.seed": drawn}
-    changes["mount.eye_mm"] = (np.array([0.0, 0.0, 700.0]) + random.uniform(-4, 4, 3)).round(2).tolist()
+    changes["mount.eye_mm"] = (np.array(config.mount.eye_mm) + random.uniform(-4, 4, 3)).round(2).tolist()
     changes["mount.tilt_deg"] = random.uniform(-0.35, 0.35, 2).round(3).tolist()
-    changes["mount.turn_deg"] = round(float(random.uniform(-1, 1)), 3)
+    changes["mount.turn_deg"] = round(config.mount.turn_deg + float(random.uniform(-1, 1)), 3)
     changes["mount.focal_px"] = round(float(random.uniform(912, 922)), 2)
     return changes | {name: round(noise * read(config, name), 6) for name in NOISES}
 
@@ -76,9 +96,9 @@ def read(config: Any, name: str) -> float:
     return float(config)
 
 
-def changed(changes: dict[str, Any]) -> WorkcellConfig:
-    """The twin as it is shipped, but for ``changes`` by their dotted names."""
-    config = twin_workcell()
+def changed(changes: dict[str, Any], config: WorkcellConfig | None = None) -> WorkcellConfig:
+    """The twin ``config``, None: as it is shipped, but for ``changes`` by their dotted names."""
+    config = config or twin_workcell()
     for name, value in changes.items():
         *path, last = name.split(".")
         part: Any = config
@@ -90,14 +110,16 @@ def changed(changes: dict[str, Any]) -> WorkcellConfig:
 
 def calibrated(folder: Path, values: dict[str, Any], robot: int) -> WorkcellConfig:
     """The robot's settings, once `calibrate` has been run on it; its files are kept."""
-    changes, kept = robot_changes(int(values["seed"]), robot, float(values["noise"])), folder / "calibration"
+    shipped = usual(values)
+    changes, kept = robot_changes(int(values["seed"]), robot, float(values["noise"]), shipped), folder / "calibration"
     changes["hardware.stop_file"], changes["twin.engine"] = str(folder / "stop"), values["engine"]
-    config = changed(changes)
+    config = changed(changes, shipped)
     config.calibration = str(kept)
-    if not is_calibrated(kept):
+    cell, hardware = values["cell"], values["hardware"]
+    if not is_calibrated(kept, tuple(config.hardware.for_arms().arms)):
         folder.mkdir(parents=True, exist_ok=True)
         words = [f"{name}={value}" for name, value in changes.items()]
-        if command_line(["calibrate", "hardware=twin", f"calibration={kept}", f"seed={robot}", *words]) != 0:
+        if command_line(["calibrate", f"cell={cell}", f"hardware={hardware}", f"calibration={kept}", f"seed={robot}", *words]) != 0:
             raise WorkFailed(f"calibration of robot {robot} failed")
     return config
 
@@ -105,8 +127,9 @@ def calibrated(folder: Path, values: dict[str, Any], robot: int) -> WorkcellConf
 class Stage:
     """An open twin with a policy at work, and all that measures it."""
 
-    def __init__(self, config: WorkcellConfig, policy: str, seed: int) -> None:
-        self.loop: ClosedLoop = make_loop(policies.adapted(policy), "hardware", config=config)
+    def __init__(self, config: WorkcellConfig, policy: str, seed: int, cell: str = "paper") -> None:
+        own = None if cell == "paper" else cell_config(cell)
+        self.loop: ClosedLoop = make_loop(policies.adapted(policy, own), "hardware", config=config)
         self.session = Session(self.loop, {"policy": policy})
         workcell = self.session.backend.workcell
         assert workcell.twin is not None
@@ -198,7 +221,8 @@ def work(task: Work, values: dict[str, Any], root: str) -> None:
     stage: Stage | None = None
     for number in task.numbers:
         try:
-            stage = stage or Stage(calibrated(folder, values, task.robot), values["policy"], int(values["seed"]) * 1000 + number)
+            config = calibrated(folder, values, task.robot)
+            stage = stage or Stage(config, values["policy"], int(values["seed"]) * 1000 + number, values["cell"])
             row = one(stage, task.part, number, task.count, int(values["seed"]))
         except Exception as failure:  # whatever it is, it is a failed episode
             row = {"end": False, "first": False, "hang": isinstance(failure, TimeoutError), "error": f"{type(failure).__name__}: {failure}"}
@@ -250,7 +274,7 @@ def soak(config: WorkcellConfig, values: dict[str, Any], path: Path, transfers: 
     """Episodes until so many transfers are done, a line for every :data:`SOAK_EVERY`; memory starts anew with each process."""
     done = rows(path)
     count, spent = sum(row["episodes"] for row in done), sum(row["transfers"] for row in done)
-    stage = Stage(config, values["policy"], int(values["seed"]))
+    stage = Stage(config, values["policy"], int(values["seed"]), values["cell"])
     starts, goals = random_problems(stage.loop.rules, transfers, int(values["seed"]))
     part = {"episodes": 0, "transfers": 0, "solved": 0, "first": 0, "violations": 0, "hangs": 0}
     try:
