@@ -244,9 +244,10 @@ class NoSharedSpace(HandoverError):
 class TwoArmsOnly(HandoverError):
     """Something that is made for two arms was asked of a cell with another number of them."""
 
-    def __init__(self, what: str, names: Sequence[str]) -> None:
-        self.what, self.names = what, tuple(names)
-        super().__init__(f"{what} is for two arms; this cell has {len(self.names)}: {', '.join(self.names)}")
+    def __init__(self, what: str, names: Sequence[str], instead: str = "") -> None:
+        self.what, self.names, self.instead = what, tuple(names), instead
+        there = f"this cell has {len(self.names)}: {listed(self.names)}"
+        super().__init__(f"{what} is for two arms; {there}{'; ' if instead else ''}{instead}")
 
 
 class UnequalArms(HandoverError):

@@ -215,10 +215,10 @@ class Cell(Sectors):
             return number[arm, receiver]
         return number[arm.cpu().numpy(), receiver.cpu().numpy()]
 
-    def require_pair(self, what: str) -> None:
-        """Raise :class:`TwoArmsOnly` unless the cell has two arms; ``what`` needs them."""
+    def require_pair(self, what: str, instead: str = "") -> None:
+        """Raise :class:`TwoArmsOnly` unless the cell has two arms; ``what`` needs them. ``instead`` says what more arms can have."""
         if self.num_arms != 2:
-            raise TwoArmsOnly(what, self.names)
+            raise TwoArmsOnly(what, self.names, instead if self.num_arms > 2 else "")
 
     def require_grip(self, finger_travel_mm: float) -> None:
         """Raise :class:`InvalidSetting` if hands that open so far cannot close on the pin; for whatever carries the block."""

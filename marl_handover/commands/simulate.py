@@ -89,8 +89,6 @@ def run(config: SimulateCommand) -> int:
     for name in ("start", "goal"):
         if (pose := getattr(config, name)) is not None:
             policy.rules.cell.require_reached(name, pose)
-    if config.video and config.captions:
-        policy.rules.cell.require_pair("a video's words below the picture, captions=true,")
     model = build_whole_cell(policy.rules.cell.config)
     camera = view(config.view, model.cell)
     backend = PhysicsBackend(model, config.motion, engine=config.engine, grasp=config.grasp, gui=config.gui, camera=camera, size=size)

@@ -82,7 +82,8 @@ class Trainer:
         config = self.config
         self.generator = torch.Generator(device=self.device).manual_seed(config.seed)
         if not isinstance(config.algorithm, GraphSacConfig):
-            load_cell(config.cell).require_pair("training")
+            asked = f"algorithm={config.algorithm.name} and variant={config.variant} take no others"
+            load_cell(config.cell).require_pair("training", f"{asked}; train preset=one_cell or preset=any_cell does")
         self.variant = make_variant(config.variant)
         self.env = self.variant.env(config, self.device)
         self.rules = self.env.rules

@@ -257,7 +257,7 @@ def _rules(cell: Cell, task: TaskConfig, motion: MotionConfig | None, about: Map
         TwoArmsOnly: the policy of a file is to act in a cell of other than two arms.
     """
     if about and about["kind"] != "graph":
-        cell.require_pair("a trained policy")
+        cell.require_pair("a trained policy", "policy=pretrained_any, exact and greedy take any cell")
     if about and about["variant"] == "centralised":
         from marl_handover.envs.centralised import CentralisedRules
 

@@ -26,16 +26,19 @@ Floats = NDArray[np.float64]
 
 _TINT, _SHARED_TINT = 0.22, 0.4
 _STRIP = 96
+_APART_MM = 60.0
+"""Neighbours on the edge of a chart that are so far apart belong to two pieces."""
 
 
 def dress(cell: SimulatedCell) -> None:
-    """Tint the sectors of the table that the arms reach and the part they share, and colour the bases, until the next reset."""
+    """Tint the sectors of the table that the arms reach and what each two of them share, and colour the bases, until the next reset."""
     model = cell.model.cell
     for index in range(len(cell.arms)):
         colour = arm_colour(index)
         cell.engine.lay(*_sector_mm(model, index), 0.1 + 0.05 * index, _tinted(colour, _TINT))
         cell.engine.paint_base(index, _rgb(colour))
-    cell.engine.lay(*_shared_mm(model), 0.2, _tinted(SHARED, _SHARED_TINT))
+    for number, (one, other) in enumerate(_shared_mm(model)):
+        cell.engine.lay(one, other, 0.1 + 0.05 * len(cell.arms) + 0.01 * number, _tinted(SHARED, _SHARED_TINT))
 
 
 def _sector_mm(cell: Cell, arm: int) -> tuple[Floats, Floats]:
@@ -48,10 +51,15 @@ def _sector_mm(cell: Cell, arm: int) -> tuple[Floats, Floats]:
     return at + ring.r_min_mm * ray, at + ring.r_max_mm * ray
 
 
-def _shared_mm(cell: Cell) -> tuple[Floats, Floats]:
-    """Lower and upper edge (n, 2) of the chart."""
+def _shared_mm(cell: Cell) -> Iterator[tuple[Floats, Floats]]:
+    """Lower and upper edge (n, 2) of every chart, one after the other; a chart of several pieces in as many."""
     along = np.linspace(-1.0, 1.0, _STRIP)
-    return np.asarray(cell.shared.to_table(along, 0 * along - 1)), np.asarray(cell.shared.to_table(along, 0 * along + 1))
+    for _, space in sorted(cell.graph.edges.items()):
+        one, other = (np.asarray(space.to_table(along, 0 * along + end)) for end in (-1, 1))
+        apart = np.maximum(*(np.hypot(*np.diff(edge, axis=0).T) for edge in (one, other))) > _APART_MM
+        for piece in np.split(np.arange(_STRIP), np.flatnonzero(apart) + 1):
+            if len(piece) > 1:
+                yield one[piece], other[piece]
 
 
 def _rgb(colour: str) -> Floats:
@@ -66,6 +74,9 @@ def _tinted(colour: str, share: float) -> Floats:
 _LINES_A_PICTURE, _WIDTH_A_LETTER = 21.0, 37.0
 """A letter is as high as a picture of this many lines, and as wide as one of so many letters of this size, whichever is smaller."""
 
+_LONGEST = 9
+"""Letters of an arm's name; longer ones are cut."""
+
 _LEADING, _MARGIN = 1.35, 0.5
 """Height of a line, and the border around all, in letters."""
 
@@ -77,8 +88,8 @@ BRIGHT = (YELLOW,)
 class Caption(NamedTuple):
     """What there is to say about one picture.
 
-    ``arm`` is the index of the one that moves, -1 before the first transfer; ``away_mm`` and ``turned_rad`` (signed) are the block's errors
-    against the goal; ``outcome`` is empty while the episode goes on.
+    ``arm`` is the index of the one that moves, -1 before the first transfer, and ``label`` what the cell calls it; ``away_mm`` and
+    ``turned_rad`` (signed) are the block's errors against the goal; ``outcome`` is empty while the episode goes on.
     """
 
     transfer: int
@@ -87,6 +98,7 @@ class Caption(NamedTuple):
     away_mm: float
     turned_rad: float
     outcome: str = ""
+    label: str = ""
 
 
 def band_px(size: tuple[int, int]) -> int:
@@ -113,7 +125,7 @@ def captioned(picture: Pixels, caption: Caption, size: tuple[int, int]) -> Pixel
     if caption.arm >= 0:
         box = [margin, first - 0.55 * letter, margin + 1.1 * letter, first + 0.55 * letter]
         draw.rectangle(box, fill=arm_colour(caption.arm))
-        draw.text((margin + 0.55 * letter, first), ARM_LETTERS[caption.arm], PAPER, _font(letter), anchor="mm")
+        draw.text((margin + 0.55 * letter, first), _label(caption)[0].upper(), PAPER, _font(letter), anchor="mm")
         left += 1.6 * letter
     draw.text((left, first), _deed(caption), INK, _font(letter), anchor="lm")
     draw.text((margin, second), _distance(caption), INK, _font(letter), anchor="lm")
@@ -123,10 +135,16 @@ def captioned(picture: Pixels, caption: Caption, size: tuple[int, int]) -> Pixel
     return np.asarray(page)
 
 
+def _label(caption: Caption) -> str:
+    return caption.label or ARM_LETTERS[caption.arm]
+
+
 def _deed(caption: Caption) -> str:
     if caption.arm < 0:
         return "the task: the block onto the green square, red bar on red bar"
-    arm = {"L": "left arm", "R": "right arm"}.get(ARM_LETTERS[caption.arm], f"arm {ARM_LETTERS[caption.arm]}")
+    label = _label(caption)
+    short = label if len(label) <= _LONGEST else f"{label[: _LONGEST - 1]}…"
+    arm = {"L": "left arm", "R": "right arm"}.get(label, f"arm {short}")
     return f"transfer {caption.transfer}: {arm}, {'final: to the goal' if caption.final else 'hand-over'}"
 
 
@@ -227,7 +245,8 @@ class Film:
         pose = self._backend.cell.object_pose()
         away_mm = math.dist(pose[:2], self._goal[:2])
         turned_rad = float(self._error(pose[2], self._goal[2]))
-        return Caption(self._transfer, self._arm, self._final, away_mm, turned_rad, self._outcome)
+        label = self._backend.cell.model.cell.labels[self._arm] if self._arm >= 0 else ""
+        return Caption(self._transfer, self._arm, self._final, away_mm, turned_rad, self._outcome, label)
 
 
 @contextmanager

@@ -150,7 +150,8 @@ class SimulatedCell:
         self._bonded = [bool(lever > LEVER_MM) if grasp is None else grasp == "constraint" for lever in levers_mm]
         self._sticky = [not grips_by_friction(arm.description, hinged=grasp == "friction") for arm in model.arms]
         self.notes = _notes(model, self._sticky, self._bonded if grasp is None else [False] * len(levers_mm))
-        table_mm = max(1000.0, *(side + 200.0 for side in model.cell.extent_mm))
+        wide = 2.0 if model.cell.num_arms > 2 else 1.0  # films of many arms look at it from far away
+        table_mm = max(1000.0, *(wide * side + 200.0 for side in model.cell.extent_mm))
         scene = Scene(model.arms, model.cell.bases, model.cell.config.block, self._sticky, table_mm)
         self.engine: Engine = open_engine(engine, scene, gui)
         self.reset((0.0, 0.0, 0.0))

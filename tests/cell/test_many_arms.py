@@ -208,7 +208,11 @@ def test_the_batched_and_the_goal_environment_take_three_arms(triangle, architec
     [
         (["train", "steps=64"], "training is for two arms; this cell has 3: arm0, arm1, arm2"),
         (["train", "steps=64", "variant=decentralised"], "training is for two arms"),
+        (["train", "steps=64", "variant=decentralised"], "variant=decentralised take no others; train preset=one_cell"),
+        (["train", "steps=64", "variant=centralised"], "variant=centralised take no others; train preset=one_cell"),
+        (["train", "steps=64", "preset=dqn_b"], "algorithm=dqn and variant=hierarchical take no others"),
         (["evaluate", "policy=pretrained_b", "episodes=1"], "is for two arms; this cell has 3: arm0, arm1, arm2"),
+        (["evaluate", "policy=pretrained_b", "episodes=1"], "policy=pretrained_any, exact and greedy take any cell"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -46,6 +46,16 @@ def test_an_episode_is_played_and_filmed(tmp_path, capsys, engine):
     ]
 
 
+def test_three_arms_are_filmed_with_words_and_colours(tmp_path, capsys, engine):
+    video = tmp_path / "three.gif"
+    more = [f"video={video}", "fps=2", "size=[64,48]", f"engine={engine}", "progress=false"]
+    assert simulate("cell=triangle", "start=[-250,100,0]", "goal=[250,100,90]", *more) == 0
+    out = capsys.readouterr().out
+    assert "1 of 1 episode reached the goal" in out
+    assert any(name in out for name in ("north to", "west to", "east to"))
+    assert len(list(imageio.get_reader(video))) > 5
+
+
 @pytest.mark.parametrize(
     ("argument", "says"),
     [

@@ -210,7 +210,7 @@ def test_problems_bring_their_cells(tmp_path):
         (["outage.arm=left", "arms.enabled=[right]"], "'left' is not known; choose one of: right, random"),
         (["outage.seed=1", "task.reward.motion_weight=1"], "no lengths of paths are known without it"),
         (["policy=greedy", "backend=noisy", "outage.arm=top"], "'top' is not known"),
-        (["policy=exact", "cell=triangle", "backend=twin"], "the hardware driver is for two arms; this cell has 3"),
+        (["policy=exact", "cell=triangle", "backend=twin"], "must be wiring of the cell's arms, north, west, east, each by its name"),
         (["policy=pretrained_b", "backend=noisy", "outage.seed=1"], "must be one that acts in any cell"),
     ],
 )

@@ -48,6 +48,31 @@ def test_a_picture_of_another_shape_shows_all_and_more(cell, width, height):
     np.testing.assert_allclose(red_centre(cell.camera_image(width, height)), wanted, atol=3)
 
 
+def require_in_picture(points_mm, camera):
+    """Assert that points (n, 3) are in the picture; how far they are across and along it (n,), in mm."""
+    away = points_mm - camera.eye_mm
+    forward = np.subtract(camera.target_mm, camera.eye_mm)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, camera.up)
+    right = right / np.linalg.norm(right)
+    depth, across, along = away @ forward, away @ right, away @ np.cross(right, forward)
+    assert np.abs(camera.focal_px * across / depth).max() < camera.width_px / 2
+    assert np.abs(camera.focal_px * along / depth).max() < camera.height_px / 2
+    return across, along
+
+
+@pytest.mark.parametrize("where", ["top", "overview"])
+@pytest.mark.parametrize("name", ["triangle", "line4", "ring6"])
+def test_cameras_over_many_arms_show_all_of_them_and_what_they_reach(name, where):
+    model = build_cell(cell_config(name))
+    rows = np.argwhere(model.grid.masks.any(axis=0))
+    places = np.column_stack([model.grid.x_mm[rows[:, 0]], model.grid.y_mm[rows[:, 1]], np.zeros(len(rows))])
+    parked = np.stack([grip_mm(model, arm, np.radians(PARKED_DEG)) for arm in range(model.cell.num_arms)])
+    camera = view(where, model.cell)
+    require_in_picture(places, camera)
+    require_in_picture(parked if where == "overview" else parked * (1, 1, 0), camera)
+
+
 @pytest.mark.parametrize("name", ["paper", "al5a"])
 def test_the_overview_shows_all_that_arms_reach_and_the_parked_hands(name):
     model = build_cell(cell_config(name))
@@ -60,12 +85,5 @@ def test_the_overview_shows_all_that_arms_reach_and_the_parked_hands(name):
         points.append(np.stack([base.x_mm + radius * np.cos(turned), base.y_mm + radius * np.sin(turned), 0 * angle], -1))
     parked = np.radians(PARKED_DEG)
     points += [grip_mm(model, arm, parked)[None] for arm in range(cell.num_arms)]
-    away = np.concatenate(points) - camera.eye_mm
-    forward = np.subtract(camera.target_mm, camera.eye_mm)
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, camera.up)
-    right = right / np.linalg.norm(right)
-    depth, across, along = away @ forward, away @ right, away @ np.cross(right, forward)
-    assert np.abs(camera.focal_px * across / depth).max() < camera.width_px / 2
-    assert np.abs(camera.focal_px * along / depth).max() < camera.height_px / 2
+    across, _ = require_in_picture(np.concatenate(points), camera)
     assert across[60:120].mean() < 0  # the left arm's outer edge is on the left

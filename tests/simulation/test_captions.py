@@ -76,3 +76,17 @@ def test_any_size_gives_that_size(width, height):
     assert band_px(size) % 2 == 0
     whole, _ = drawn(WIDEST, size)
     assert whole.shape == (size[1], size[0], 3)
+
+
+def test_an_arm_of_many_is_called_by_its_name_and_a_long_one_is_cut():
+    """The box has its colour and first letter; names differ in words, and even the longest leaves room for the outcome."""
+    size = (640, 360)
+    many = [Caption(1, 2, False, 100.0, 0.5, label=label) for label in ("east", "west", "a very long name of an arm")]
+    bands = [drawn(caption, size)[1] for caption in many]
+    for band in bands:
+        assert len(rows_and_columns(band, arm_colour(2))[0]) > 0
+    assert (bands[0] != bands[1]).any()
+    long = WIDEST._replace(label="a very long name of an arm")
+    _, box = rows_and_columns(drawn(long, size)[1], OUTCOMES["wrong_orientation"])
+    _, words = rows_and_columns(drawn(long._replace(outcome=""), size)[1])
+    assert words.max() < box.min()
