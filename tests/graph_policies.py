@@ -10,11 +10,13 @@ from marl_handover.learning.graph_network import GraphShape, HandoverGraphs, bra
 from marl_handover.policies.graph_policy import GraphPolicy
 from marl_handover.task.observations import observe
 
+SHAPE = GraphShape(width=64, rounds=6, components=2, slack=True)
+
 
 def random_weights(shape=None, seed=0, gain=1.5):
     """Layers by name: weights (inputs, outputs) and biases (outputs,), float32."""
     draw = np.random.default_rng(seed)
-    sizes = layer_sizes(shape or GraphShape())
+    sizes = layer_sizes(shape or SHAPE)
     made = {name: (draw.normal(size=size) * gain / np.sqrt(size[0]), 0.1 * draw.normal(size=size[1])) for name, size in sizes.items()}
     return {name: (weight.astype(np.float32), bias.astype(np.float32)) for name, (weight, bias) in made.items()}
 
@@ -29,7 +31,7 @@ def stored(shape, weights):
 
 def balanced_weights(rules, start, goal, seed=0, shape=None):
     """Random layers that want to finish about two in five of the problems (n, 3), (n, 3)."""
-    shape, weights = shape or GraphShape(), random_weights(shape, seed)
+    shape, weights = shape or SHAPE, random_weights(shape, seed)
     policy = GraphPolicy(rules, "random weights", *stored(shape, weights))
     seen = observe(rules, "graph", start, goal, np.full(len(start), -1)).astype(np.float32)
     graph = HandoverGraphs(seen, rules.cell.num_arms)
@@ -42,7 +44,7 @@ def balanced_weights(rules, start, goal, seed=0, shape=None):
 
 def random_policy(rules, start, goal, seed=0, shape=None):
     """A policy of such weights under a rule book."""
-    shape = shape or GraphShape()
+    shape = shape or SHAPE
     return GraphPolicy(rules, "random weights", *stored(shape, balanced_weights(rules, start, goal, seed, shape)))
 
 

@@ -312,9 +312,9 @@ class DecentralisedSac(HybridSac):
         needed = (observation[:, REACHES] > 0) & (observation[:, OWN + 1] > 0)
         branches.logits[:, 0, PASS] -= torch.where(needed, torch.inf, 0.0)
         place, _ = squashed_sample(branches, self._noise(branches.mean.shape) * exploring[:, None, None, None])
-        uniform = torch.rand(branches.logits.flatten(1).shape, generator=self.generator, device=self.device)
+        uniform = self._uniform(branches.logits.flatten(1).shape)
         gumbel = -(-uniform.clamp_min(1e-20).log()).log()
-        anywhere = torch.rand(place.shape[:-1], generator=self.generator, device=self.device) < self.config.random_place
+        anywhere = self._uniform(place.shape[:-1]) < self.config.random_place
         anywhere &= exploring[:, None, None]
         place = torch.where(anywhere[..., None], self._anywhere(place.shape), place)
         return turn_action(branches.logits, place, gumbel * exploring[:, None])

@@ -155,7 +155,7 @@ class Dqn(Algorithm):
     @torch.no_grad()
     def explore(self, observation: Tensor) -> Tensor:
         """The best choice, or a random one."""
-        random = torch.rand(len(observation), 1, generator=self.generator, device=self.device) < self.random_share
+        random = self._uniform((len(observation), 1)) < self.random_share
         return torch.where(random, self.random_action(observation), self.act(observation))
 
     def index(self, action: Tensor, arm: Tensor, final: Tensor) -> Tensor:

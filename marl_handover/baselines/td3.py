@@ -92,9 +92,9 @@ class Td3(Algorithm):
     def explore(self, observation: Tensor) -> Tensor:
         """The policy's action with Gaussian noise, or a uniform one."""
         action = self.act(observation)
-        noise = torch.randn(action.shape, generator=self.generator, device=self.device) * self.config.exploration_std
+        noise = self._noise(action.shape) * self.config.exploration_std
         uniform = self.random_action(observation)
-        random = torch.rand(len(action), 1, generator=self.generator, device=self.device) < self.config.random_action
+        random = self._uniform((len(action), 1)) < self.config.random_action
         return torch.where(random, uniform, (action + noise).clamp(-1, 1))
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:

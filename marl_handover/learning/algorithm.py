@@ -22,6 +22,9 @@ from marl_handover.learning.settings import ALGORITHMS, AlgorithmConfig, OffPoli
 from marl_handover.progress import working
 from marl_handover.task.rules import Rules
 
+EDGE = 1.15
+"""Random places are drawn from a chart, or an interval, this much too large and brought back to its edge."""
+
 KNOTS = 4097
 """Of the table that turns chart coordinates that are uniform into ones whose places are."""
 
@@ -178,6 +181,16 @@ class Algorithm(ABC):
         """Inverse of :meth:`state_dict`."""
         for name, part in self.modules().items():
             part.load_state_dict(state[name])
+
+    def _anywhere(self, shape: tuple[int, ...]) -> Tensor:
+        """Places spread evenly over [-1, 1], with a share exactly on the edge, where the largest turns are made."""
+        return ((2 * self._uniform(shape) - 1) * EDGE).clamp(-1.0, 1.0)
+
+    def _uniform(self, shape: tuple[int, ...]) -> Tensor:
+        return torch.rand(shape, generator=self.generator, device=self.device)
+
+    def _noise(self, shape: tuple[int, ...]) -> Tensor:
+        return torch.randn(shape, generator=self.generator, device=self.device)
 
 
 def stepped(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:

@@ -21,8 +21,8 @@ Layers = Mapping[str, Callable[[Array], Array]]
 HARMONICS = 4
 """Multiples of an angle that the network sees, and that what arms tell each other is turned by."""
 
-FACTS = 12
-"""Numbers that :func:`arm_facts` says of an arm at an angle."""
+ARM_FEATURES = 12
+"""Numbers that :func:`arm_features` says of an arm at an angle."""
 
 MARGIN_SLOPE, FINISH_SLOPE = 4.0, 20.0
 """How steeply a margin goes from -1 to 1 where an error is epsilon, in units of epsilon. The steep one is for who decides to finish only:
@@ -44,10 +44,10 @@ class GraphShape(NamedTuple):
     interval; ``slack``: whether it is told how far an angle is inside what lets the next arm finish.
     """
 
-    width: int = 64
-    rounds: int = 6
-    components: int = 2
-    slack: bool = True
+    width: int
+    rounds: int
+    components: int
+    slack: bool
 
 
 def stored_shape(stored: Mapping[str, Any]) -> GraphShape:
@@ -61,17 +61,17 @@ def stored_shape(stored: Mapping[str, Any]) -> GraphShape:
 
 def layer_sizes(shape: GraphShape) -> dict[str, tuple[int, int]]:
     """Inputs and outputs of each layer."""
-    width, told = shape.width, FACTS + 2 * HARMONICS
+    width, told = shape.width, ARM_FEATURES + 2 * HARMONICS
     sizes = {
         "embed": (2 + 2 * HARMONICS, width),
         "message": (2 * width + 4 + 2 * HARMONICS, width),
         "message_out": (width, width + 1),
         "revise": (2 * width + 1, width),
         "revise_out": (width, width),
-        "finish": (FACTS + 1, 32),
+        "finish": (ARM_FEATURES + 1, 32),
         "finish_hidden": (32, 32),
         "finish_out": (32, 1),
-        "place": (2 * width + FACTS + told + 5, width),
+        "place": (2 * width + ARM_FEATURES + told + 5, width),
         "place_hidden": (width, width),
         "place_out": (width, 2 * shape.components),
     }
@@ -152,23 +152,23 @@ def embedded(layers: Layers, shape: GraphShape, graph: HandoverGraphs) -> Array:
     """What the network keeps of every arm, (A, width): of goal, epsilon and layout, not of where the object is."""
     xp = namespace(graph.angle)
     reach, goal = graph.reaches_goal[:, None], _harmonics(graph.goal_angle)
-    known = layers["embed"](xp.concat([reach, xp.log(graph.epsilon)[:, None], reach * goal], -1))
+    embedding = layers["embed"](xp.concat([reach, xp.log(graph.epsilon)[:, None], reach * goal], -1))
     half, turn = graph.half[:, None], _harmonics(graph.middle)
     there = reach[graph.receiver]
     fixed = xp.concat([half, xp.cos(half), xp.sin(half), there, there * _harmonics(graph.goal_angle[graph.receiver] - graph.middle)], -1)
     for _ in range(shape.rounds):
-        told = xp.concat([known[graph.giver], _turned_back(known[graph.receiver], turn), fixed], -1)
+        told = xp.concat([embedding[graph.giver], _turned_back(embedding[graph.receiver], turn), fixed], -1)
         message = layers["message_out"](_positive(layers["message"](told)))
         weight = xp.exp(_clipped(message[:, -1:], -SCORE, SCORE))
         total = graph.summed(weight) + 1e-6
         heard = graph.summed(weight * _positive(message[:, :-1])) / total
-        update = layers["revise"](xp.concat([known, heard, xp.log(total) / 4], -1))
-        known = _normalised(known + layers["revise_out"](_positive(update)))
-    return known
+        update = layers["revise"](xp.concat([embedding, heard, xp.log(total) / 4], -1))
+        embedding = _normalised(embedding + layers["revise_out"](_positive(update)))
+    return embedding
 
 
-def arm_facts(graph: HandoverGraphs, arm: Array, angle: Array, slack: bool = True) -> Array:
-    """What can be told of rows of arms (...) that carry the object at angles (...) [rad]: (..., :data:`FACTS`).
+def arm_features(graph: HandoverGraphs, arm: Array, angle: Array, slack: bool = True) -> Array:
+    """What can be told of rows of arms (...) that carry the object at angles (...) [rad]: (..., :data:`ARM_FEATURES`).
 
     Whether the arm reaches the goal, how well it would finish, and how far inside (above 0) or outside the angle is of those that let the
     arm hand over to one that finishes.
@@ -176,7 +176,7 @@ def arm_facts(graph: HandoverGraphs, arm: Array, angle: Array, slack: bool = Tru
     xp = namespace(angle)
     reach, epsilon, error = graph.reaches_goal[arm], graph.epsilon[arm], wrap(angle - graph.goal_angle[arm])
     away = onward(graph, arm, angle)[0] if slack else 0 * angle
-    facts = [
+    features = [
         reach,
         reach * (1 + _clipped(MARGIN_SLOPE * (1 - abs(error) / epsilon), -1, 1)) - 1,
         reach * _clipped(error / epsilon / 4, -1, 1),
@@ -184,7 +184,7 @@ def arm_facts(graph: HandoverGraphs, arm: Array, angle: Array, slack: bool = Tru
         _clipped(away / epsilon / 4, -1, 1),
         xp.log(epsilon),
     ]
-    return xp.concat([xp.stack(facts, -1), reach[..., None] * _harmonics(error, 3)], -1)
+    return xp.concat([xp.stack(features, -1), reach[..., None] * _harmonics(error, 3)], -1)
 
 
 def onward(graph: HandoverGraphs, arm: Array, angle: Array) -> tuple[Array, Array]:
@@ -203,11 +203,11 @@ def onward(graph: HandoverGraphs, arm: Array, angle: Array) -> tuple[Array, Arra
     return slack, xp.sign(missing) * _positive(-slack) * (slack > -math.pi)
 
 
-def hand_over_value(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known: Array, arm: Array, angle: Array) -> Array:
+def hand_over_value(layers: Layers, shape: GraphShape, graph: HandoverGraphs, embedding: Array, arm: Array, angle: Array) -> Array:
     """Twin values (2, ...) of handing the object to rows of arms (...) such that they carry it at angles (...)."""
     xp = namespace(angle)
     turn = _harmonics(angle)
-    told = xp.concat([_turned_back(known[arm], turn), arm_facts(graph, arm, angle, shape.slack), turn], -1)
+    told = xp.concat([_turned_back(embedding[arm], turn), arm_features(graph, arm, angle, shape.slack), turn], -1)
     values = []
     for twin in range(2):
         hidden = _positive(_normalised(layers[f"value_{twin}"](told)))
@@ -215,23 +215,23 @@ def hand_over_value(layers: Layers, shape: GraphShape, graph: HandoverGraphs, kn
     return xp.stack(values)
 
 
-def finish_value(layers: Layers, facts: Array) -> Array:
-    """Value (...) of finishing with arms of which :func:`arm_facts` says ``facts`` (..., :data:`FACTS`)."""
-    xp = namespace(facts)
-    steep = _clipped(FINISH_SLOPE / MARGIN_SLOPE * facts[..., 1:2], -1, 1)
-    hidden = _positive(layers["finish"](xp.concat([facts, steep], -1)))
+def finish_value(layers: Layers, features: Array) -> Array:
+    """Value (...) of finishing with arms of which :func:`arm_features` says ``features`` (..., :data:`ARM_FEATURES`)."""
+    xp = namespace(features)
+    steep = _clipped(FINISH_SLOPE / MARGIN_SLOPE * features[..., 1:2], -1, 1)
+    hidden = _positive(layers["finish"](xp.concat([features, steep], -1)))
     value: Array = layers["finish_out"](_positive(layers["finish_hidden"](hidden)))[..., 0]
     return value
 
 
-def best_places(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known: Array, facts: Array) -> tuple[Array, Array]:
+def best_places(layers: Layers, shape: GraphShape, graph: HandoverGraphs, embedding: Array, features: Array) -> tuple[Array, Array]:
     """Where in each interval the giver hands over: mean and log standard deviation (E, components) of the place before the tanh that
-    brings it into (-1, 1), the interval's ends. ``facts`` (A, :data:`FACTS`) are those of the arms at their angles.
+    brings it into (-1, 1), the interval's ends. ``features`` (A, :data:`ARM_FEATURES`) are those of the arms at their angles.
 
     The first component starts from the place nearest to where the receiver can finish, the second from the nearest to where it can hand
     over to an arm that can; what is learned is the difference.
     """
-    xp, half, angle = namespace(facts), graph.half, graph.angle[graph.giver]
+    xp, half, angle = namespace(features), graph.half, graph.angle[graph.giver]
     there = angle + graph.middle
     turn = _harmonics(there)
     reach, missing = graph.reaches_goal[graph.receiver], wrap(graph.goal_angle[graph.receiver] - there)
@@ -239,10 +239,10 @@ def best_places(layers: Layers, shape: GraphShape, graph: HandoverGraphs, known:
     width = half + 0.05
     own = [half, reach * _clipped(missing / width, -2, 2), _clipped(change / width, -2, 2), (slack > -math.pi) + 0 * half, xp.log(width)]
     parts = [
-        _turned_back(known[graph.giver], _harmonics(angle)),
-        _turned_back(known[graph.receiver], turn),
-        facts[graph.giver],
-        arm_facts(graph, graph.receiver, there, shape.slack),
+        _turned_back(embedding[graph.giver], _harmonics(angle)),
+        _turned_back(embedding[graph.receiver], turn),
+        features[graph.giver],
+        arm_features(graph, graph.receiver, there, shape.slack),
         turn,
         xp.stack(own, -1),
     ]
@@ -278,15 +278,15 @@ def branches(layers: Layers, shape: GraphShape, graph: HandoverGraphs) -> tuple[
     A problem and its mirror image are looked at alike: places are those that the actor says of either, values the mean of both.
     """
     xp, both, edges = namespace(graph.angle), graph.with_mirror(), len(graph.giver)
-    known = embedded(layers, shape, both)
-    facts = arm_facts(both, slice(None), both.angle, shape.slack)
-    said = xp.tanh(best_places(layers, shape, both, known, facts)[0])
+    embedding = embedded(layers, shape, both)
+    features = arm_features(both, slice(None), both.angle, shape.slack)
+    said = xp.tanh(best_places(layers, shape, both, embedding, features)[0])
     place = xp.concat([said[:edges], -said[edges:]], -1)
     tried = xp.concat([place, -place])
     there = arrival(both, both.angle[both.giver], tried, slice(None))
     receiver = both.receiver[:, None] + xp.zeros_like(tried, dtype=xp.int64)
-    value = xp.amin(hand_over_value(layers, shape, both, known, receiver, there), 0)
-    finish = finish_value(layers, facts)
+    value = xp.amin(hand_over_value(layers, shape, both, embedding, receiver, there), 0)
+    finish = finish_value(layers, features)
     return (value[:edges] + value[edges:]) / 2, place, (finish[: len(graph.arm)] + finish[len(graph.arm) :]) / 2
 
 
@@ -341,17 +341,17 @@ def _harmonics(angle: Array, count: int = HARMONICS) -> Array:
     return xp.concat([xp.cos(multiples), xp.sin(multiples)], -1)
 
 
-def _turned_back(known: Array, turn: Array) -> Array:
-    """What is known (..., width), turned back by angles with harmonics ``turn`` (..., 2 * :data:`HARMONICS`).
+def _turned_back(embedding: Array, turn: Array) -> Array:
+    """An embedding (..., width), turned back by angles with harmonics ``turn`` (..., 2 * :data:`HARMONICS`).
 
     Its first half stays, the rest are pairs that turn by multiples of the angle.
     """
-    xp, kept = namespace(known), known.shape[-1] // 2
-    pairs = known[..., kept:].reshape(*known.shape[:-1], 2, -1, HARMONICS)
+    xp, kept = namespace(embedding), embedding.shape[-1] // 2
+    pairs = embedding[..., kept:].reshape(*embedding.shape[:-1], 2, -1, HARMONICS)
     cos, sin = turn[..., None, :HARMONICS], turn[..., None, HARMONICS:]
     first, second = pairs[..., 0, :, :], pairs[..., 1, :, :]
-    shape = (*known.shape[:-1], -1)
-    return xp.concat([known[..., :kept], (first * cos + second * sin).reshape(shape), (second * cos - first * sin).reshape(shape)], -1)
+    shape = (*embedding.shape[:-1], -1)
+    return xp.concat([embedding[..., :kept], (first * cos + second * sin).reshape(shape), (second * cos - first * sin).reshape(shape)], -1)
 
 
 def _normalised(x: Array) -> Array:

@@ -22,7 +22,7 @@ from marl_handover.learning.graph_network import (
     GraphShape,
     HandoverGraphs,
     Layers,
-    arm_facts,
+    arm_features,
     arrival,
     best_places,
     branches,
@@ -32,7 +32,7 @@ from marl_handover.learning.graph_network import (
     hand_over_value,
     layer_sizes,
 )
-from marl_handover.learning.hybrid_sac import EDGE, averaging
+from marl_handover.learning.hybrid_sac import averaging
 from marl_handover.learning.networks import squashed
 from marl_handover.learning.settings import GraphSacConfig, TrainConfig
 from marl_handover.task.graph_observation import ARCS, ARM_FIELDS
@@ -132,14 +132,14 @@ class GraphSac(Algorithm):
     def explore(self, observation: Tensor) -> Tensor:
         """A branch and a place drawn from the policy."""
         graph = self.graphs(observation)
-        known = embedded(self.network.layers, self.shape, graph)
-        facts = arm_facts(graph, self._arms(graph), graph.angle, self.shape.slack)
-        sampled = self._sampled(graph, known, facts)
+        embedding = embedded(self.network.layers, self.shape, graph)
+        features = arm_features(graph, self._arms(graph), graph.angle, self.shape.slack)
+        sampled = self._sampled(graph, embedding, features)
         place = torch.where(
             self._uniform(sampled.place.shape) < self.config.random_place, self._anywhere(sampled.place.shape), sampled.place
         )
-        value = self._value(self.network.layers, graph, known, place)
-        finish = finish_value(self.network.layers, facts)
+        value = self._value(self.network.layers, graph, embedding, place)
+        finish = finish_value(self.network.layers, features)
         noise = self._gumbel(value.shape), self._gumbel(finish.shape)
         # Some cells follow the likeliest branch: where that goes in circles, its states must get into the memory.
         steady = torch.arange(graph.count, device=self.device) < int(self.config.deterministic_env_fraction * graph.count)
@@ -158,33 +158,33 @@ class GraphSac(Algorithm):
         """One step of critic and actor, on the states that sampled transitions led to; on those they began with where they ended it."""
         over = batch["next", "terminated"]
         graph = self.graphs(torch.where(over, batch["observation"], batch["next", "observation"]))
-        known = embedded(self.network.layers, self.shape, graph)
+        embedding = embedded(self.network.layers, self.shape, graph)
         arm = self._arms(graph)
-        facts = arm_facts(graph, arm, graph.angle, self.shape.slack)
-        sampled = self._sampled(graph, known.detach(), facts)
+        features = arm_features(graph, arm, graph.angle, self.shape.slack)
+        sampled = self._sampled(graph, embedding.detach(), features)
         with torch.no_grad():
-            target, share = self._soft_value(graph, facts, sampled)
-        value = hand_over_value(self.network.layers, self.shape, graph, known, arm, graph.angle)
-        finish = finish_value(self.network.layers, facts)
+            target, share = self._soft_value(graph, features, sampled)
+        value = hand_over_value(self.network.layers, self.shape, graph, embedding, arm, graph.angle)
+        finish = finish_value(self.network.layers, features)
         loss_place = (value - target).square().mean(1).sum()
         loss_finish = (finish - self._finish_reward(graph)).square().mean()
         self.critic_optimizer.zero_grad()
         (loss_place + self.config.finish_weight * loss_finish).backward()
         torch.nn.utils.clip_grad_norm_(self.network.parts(of_actor=False), GRADIENT_NORM)
         self.critic_optimizer.step()
-        loss_actor = self._actor_loss(graph, known.detach(), sampled, share)
+        loss_actor = self._actor_loss(graph, embedding.detach(), sampled, share)
         stepped(self.actor_optimizer, loss_actor)
         with torch.no_grad():
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), self.config.tau)
         return {"loss_critic": loss_place.detach(), "loss_finish": loss_finish.detach(), "loss_actor": loss_actor.detach()}
 
-    def _soft_value(self, graph: HandoverGraphs, facts: Tensor, sampled: Sampled) -> tuple[Tensor, Tensor]:
+    def _soft_value(self, graph: HandoverGraphs, features: Tensor, sampled: Sampled) -> tuple[Tensor, Tensor]:
         """What handing over to each arm is worth by what it can do next, (A,), and the share (E, components) of each branch of it."""
         own, scale = self.config, self.config.reward_scale
-        known = embedded(self.average.layers, self.shape, graph)
-        value = self._value(self.average.layers, graph, known, sampled.place)
+        embedding = embedded(self.average.layers, self.shape, graph)
+        value = self._value(self.average.layers, graph, embedding, sampled.place)
         value = value - own.place_temperature * sampled.log_prob.clamp(-3.0, 6.0)
-        finish = finish_value(self.average.layers, facts)
+        finish = finish_value(self.average.layers, features)
         best = value.new_full(finish.shape, -torch.inf).scatter_reduce(0, graph.giver, value.amax(-1), "amax").maximum(finish)
         weight = ((value - best[graph.giver, None]) / self.temperature).exp()
         weight_finish = ((finish - best) / self.temperature).exp()
@@ -199,20 +199,20 @@ class GraphSac(Algorithm):
         there = (graph.reaches_goal > 0) & (wrap(graph.angle - graph.goal_angle).abs() <= graph.epsilon)
         return self.config.reward_scale * torch.where(there, reward.success, reward.failure)
 
-    def _actor_loss(self, graph: HandoverGraphs, known: Tensor, sampled: Sampled, share: Tensor) -> Tensor:
+    def _actor_loss(self, graph: HandoverGraphs, embedding: Tensor, sampled: Sampled, share: Tensor) -> Tensor:
         """The soft gradient of the places drawn, and a pull of the best mean to the nearest of some places that beat it by a margin."""
         own = self.config
         for parameter in self.network.parts(of_actor=False):
             parameter.requires_grad_(False)
-        value = self._value(self.network.layers, graph, known, sampled.place)
+        value = self._value(self.network.layers, graph, embedding, sampled.place)
         loss = ((0.1 + share) * (own.place_temperature * sampled.log_prob - value)).mean()
         some = torch.arange(int(own.candidate_share * len(graph.giver)), device=self.device)
-        loss = loss + own.candidate_weight * self._pull(graph, known, sampled.mean[some], some) if len(some) else loss
+        loss = loss + own.candidate_weight * self._pull(graph, embedding, sampled.mean[some], some) if len(some) else loss
         for parameter in self.network.parts(of_actor=False):
             parameter.requires_grad_(True)
         return loss
 
-    def _pull(self, graph: HandoverGraphs, known: Tensor, mean: Tensor, edge: Tensor) -> Tensor:
+    def _pull(self, graph: HandoverGraphs, embedding: Tensor, mean: Tensor, edge: Tensor) -> Tensor:
         """Squared distance of the best mean (m, components) of rows of intervals (m,) to the *nearest* of some places that beat it.
 
         The nearest, not the best: between two equally good regions the mean would be left in the bad middle.
@@ -222,7 +222,7 @@ class GraphSac(Algorithm):
             component = torch.randint(components, (own.candidates,), generator=self.generator, device=self.device)
             beside = (mean[:, component] + self._nearby((len(edge), own.candidates))).clamp(-1.0, 1.0)
             tried = torch.cat([mean, self._anywhere((len(edge), own.candidates)), beside], -1)
-            worth = self._value(self.network.layers, graph, known, tried, edge)
+            worth = self._value(self.network.layers, graph, embedding, tried, edge)
             best, taken = worth[:, :components].max(-1, keepdim=True)
             gain = worth[:, components:] - best - own.candidate_margin
         distance = (mean.gather(1, taken) - tried[:, components:]).square()
@@ -232,16 +232,16 @@ class GraphSac(Algorithm):
     def _arms(self, graph: HandoverGraphs) -> Tensor:
         return torch.arange(len(graph.arm), device=self.device)
 
-    def _sampled(self, graph: HandoverGraphs, known: Tensor, facts: Tensor) -> Sampled:
-        mean, log_std = best_places(self.network.layers, self.shape, graph, known, facts)
+    def _sampled(self, graph: HandoverGraphs, embedding: Tensor, features: Tensor) -> Sampled:
+        mean, log_std = best_places(self.network.layers, self.shape, graph, embedding, features)
         place, log_prob = squashed(mean, log_std, self._noise(mean.shape))
         return Sampled(place, log_prob, mean.tanh())
 
-    def _value(self, layers: Layers, graph: HandoverGraphs, known: Tensor, place: Tensor, edge: Tensor | None = None) -> Tensor:
+    def _value(self, layers: Layers, graph: HandoverGraphs, embedding: Tensor, place: Tensor, edge: Tensor | None = None) -> Tensor:
         """The lower twin values (m, k) of handing over at ``place`` (m, k) in the rows ``edge`` (m,) of intervals, or in all."""
         rows = torch.arange(len(graph.giver), device=self.device) if edge is None else edge
         there = arrival(graph, graph.angle[graph.giver[rows]], place, rows)
-        value: Tensor = hand_over_value(layers, self.shape, graph, known, graph.receiver[rows, None].expand_as(there), there).amin(0)
+        value: Tensor = hand_over_value(layers, self.shape, graph, embedding, graph.receiver[rows, None].expand_as(there), there).amin(0)
         return value
 
     def _action(self, observation: Tensor, graph: HandoverGraphs, choice: Choice) -> Tensor:
@@ -255,19 +255,9 @@ class GraphSac(Algorithm):
         who = [2.0 * nn.functional.one_hot(arm, count) - 1.0 for arm in (choice.arm, receiver)]
         return torch.cat([torch.where(choice.final, 1.0, -1.0)[:, None], *who, torch.stack([alpha, 0 * alpha], -1)], -1)
 
-    def _anywhere(self, shape: tuple[int, ...]) -> Tensor:
-        """Places spread evenly over an interval, with a share exactly at its ends."""
-        return ((2 * self._uniform(shape) - 1) * EDGE).clamp(-1.0, 1.0)
-
     def _nearby(self, shape: tuple[int, ...]) -> Tensor:
         """Offsets of sizes from a hundredth to a third."""
         return 10 ** -(0.5 + 1.5 * self._uniform(shape)) * self._noise(shape)
 
     def _gumbel(self, shape: tuple[int, ...]) -> Tensor:
         return -(-self._uniform(shape).clamp_min(1e-20).log()).clamp_min(1e-20).log()
-
-    def _uniform(self, shape: tuple[int, ...]) -> Tensor:
-        return torch.rand(shape, generator=self.generator, device=self.device)
-
-    def _noise(self, shape: tuple[int, ...]) -> Tensor:
-        return torch.randn(shape, generator=self.generator, device=self.device)

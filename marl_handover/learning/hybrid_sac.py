@@ -23,10 +23,6 @@ from marl_handover.learning.settings import SacConfig, TrainConfig
 from marl_handover.task.observations import observe
 from marl_handover.task.rules import Command, Rules
 
-EDGE = 1.15
-"""Random places are drawn from a chart this much too large and brought back to its edge."""
-
-
 Network = TypeVar("Network", bound=nn.Module)
 
 
@@ -259,9 +255,9 @@ class HybridSac(Algorithm):
         # Some cells follow the deterministic policy: where that goes in circles, its states must get into the memory.
         exploring = torch.arange(len(observation), device=self.device) >= int(self.config.deterministic_env_fraction * len(observation))
         place, _ = squashed_sample(branches, self._noise(branches.mean.shape) * exploring[:, None, None, None])
-        uniform = torch.rand(branches.logits.flatten(1).shape, generator=self.generator, device=self.device)
+        uniform = self._uniform(branches.logits.flatten(1).shape)
         gumbel = -(-uniform.clamp_min(1e-20).log()).log()
-        anywhere = torch.rand(place.shape[:-1], generator=self.generator, device=self.device) < self.config.random_place
+        anywhere = self._uniform(place.shape[:-1]) < self.config.random_place
         anywhere &= exploring[:, None, None]
         place = torch.where(anywhere[..., None], self.uniform.spread(self._anywhere(place.shape)), place)
         return chosen_action(branches.logits, place, gumbel * exploring[:, None])
@@ -302,15 +298,6 @@ class HybridSac(Algorithm):
         """Let the average follow the trained actor by a step."""
         torch._foreach_lerp_(list(self.average.parameters()), list(self.trained().parameters()), self.config.actor_tau)
 
-    def _anywhere(self, shape: tuple[int, ...]) -> Tensor:
-        """Chart coordinates spread evenly, with a share exactly on the edge, where the largest turns are made."""
-        uniform = torch.rand(shape, generator=self.generator, device=self.device) * 2 - 1
-        return (uniform * EDGE).clamp(-1.0, 1.0)
-
     def _nearby(self, shape: tuple[int, ...]) -> Tensor:
         """Offsets in the chart, of sizes from a hundredth to a third."""
-        size = 10 ** -(0.5 + 1.5 * torch.rand(*shape[:-1], 1, generator=self.generator, device=self.device))
-        return size * self._noise(shape)
-
-    def _noise(self, shape: tuple[int, ...]) -> Tensor:
-        return torch.randn(shape, generator=self.generator, device=self.device)
+        return 10 ** -(0.5 + 1.5 * self._uniform((*shape[:-1], 1))) * self._noise(shape)

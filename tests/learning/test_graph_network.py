@@ -16,7 +16,7 @@ from marl_handover.config import LayoutConfig, TaskConfig
 from marl_handover.learning.graph_network import (
     GraphShape,
     HandoverGraphs,
-    arm_facts,
+    arm_features,
     arrival,
     best_places,
     branches,
@@ -31,13 +31,13 @@ from marl_handover.learning.graph_network import (
 from marl_handover.task.observations import observe
 from marl_handover.task.problems import sample_problems
 from marl_handover.task.rules import Rules
-from tests.graph_policies import random_weights
+from tests.graph_policies import SHAPE, random_weights
 
 MANY = [
     LayoutConfig(arms=[2, 8], r_min_mm=[120.0, 160.0], r_max_mm=[215.0, 260.0], yaw_deg=[60.0, 132.0], obstacles=[0, 4]),
     LayoutConfig(arms=[2, 4], spacing_mm=[60.0, 250.0], apart_mm=60.0, obstacles=[0, 3], radius_mm=[5.0, 20.0]),
 ]
-SHAPES = [GraphShape(), GraphShape(width=32, rounds=0, components=1), GraphShape(width=16, rounds=2, components=3, slack=False)]
+SHAPES = [SHAPE, GraphShape(width=32, rounds=0, components=1, slack=True), GraphShape(width=16, rounds=2, components=3, slack=False)]
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +163,7 @@ def test_of_a_mirror_image_the_mirrored_is_chosen(seen, shape):
 def test_what_an_arm_is_told_does_not_depend_on_where_the_object_is(seen):
     """Goal, epsilon and layout alone: so an arm's value as a function of the angle is one function a cell and goal."""
     rules, observation = seen
-    shape = GraphShape()
+    shape = SHAPE
     graph = HandoverGraphs(observation, rules.cell.num_arms)
     before = embedded(in_numpy(shape), shape, graph)
     graph.angle = graph.angle + 1.0
@@ -173,7 +173,7 @@ def test_what_an_arm_is_told_does_not_depend_on_where_the_object_is(seen):
 
 def test_full_turns_of_any_angle_change_nothing(seen):
     rules, observation = seen
-    shape, layers = GraphShape(), in_numpy(GraphShape())
+    shape, layers = SHAPE, in_numpy(SHAPE)
     graph, draw = HandoverGraphs(observation.astype(float), rules.cell.num_arms), np.random.default_rng(0)
     expected = branches(layers, shape, graph)
     for name in ("angle", "goal_angle", "middle"):
@@ -214,16 +214,16 @@ def test_places_are_means_of_both_images_and_values_the_mean_of_the_lower_twins(
     value, place, finish = branches(layers, shape, graph)
     said, worth, ends = [], [], []
     for view, sign in images:
-        known = embedded(layers, shape, view)
-        facts = arm_facts(view, np.arange(len(view.arm)), view.angle, shape.slack)
-        mean, log_std = best_places(layers, shape, view, known, facts)
+        embedding = embedded(layers, shape, view)
+        features = arm_features(view, np.arange(len(view.arm)), view.angle, shape.slack)
+        mean, log_std = best_places(layers, shape, view, embedding, features)
         assert (log_std >= -6).all()
         assert (log_std <= 1).all()
         said.append(sign * np.tanh(mean))
         there = arrival(view, view.angle[view.giver], sign * place, np.arange(len(view.giver)))
         receiver = np.broadcast_to(view.receiver[:, None], there.shape)
-        worth.append(np.minimum(*hand_over_value(layers, shape, view, known, receiver, there)))
-        ends.append(finish_value(layers, facts))
+        worth.append(np.minimum(*hand_over_value(layers, shape, view, embedding, receiver, there)))
+        ends.append(finish_value(layers, features))
     np.testing.assert_allclose(place, np.concatenate(said, -1), atol=1e-6)
     np.testing.assert_allclose(value, sum(worth) / 2, atol=1e-5)
     np.testing.assert_allclose(finish, sum(ends) / 2, atol=1e-5)
@@ -245,7 +245,7 @@ def test_a_stored_shape_is_what_was_stored(width, rounds, components, slack):
 )
 def test_a_shape_that_cannot_be_is_refused(lie):
     with pytest.raises((ValueError, TypeError)):
-        stored_shape({**GraphShape()._asdict(), **lie})
+        stored_shape({**SHAPE._asdict(), **lie})
 
 
 @pytest.mark.parametrize("kept", [1.0, 0.4])

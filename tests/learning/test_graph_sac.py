@@ -101,6 +101,29 @@ def test_actions_lead_to_the_angle_at_which_the_learner_thinks_that_the_next_arm
     assert away.abs().max() < 2e-3
 
 
+@pytest.mark.parametrize("half_turns", [0, 1])
+def test_the_learner_rewards_finishing_as_the_rule_book_does(small, half_turns):
+    """Arm by arm: what it says of finishing from the graph alone is what the rule book pays for that final transfer."""
+    made, _, start, goal, previous = learner(small)
+    goal = goal.clone()
+    goal[::2, 2] = start[::2, 2] + half_turns * math.pi  # some of them are nearly there
+    graph = made.graphs(observe(made.rules, "graph", start, goal, previous))
+    reward, count = made.rules.config.reward, made.rules.cell.num_arms
+    earned = made._finish_reward(graph) / made.config.reward_scale
+    close = ((graph.angle - graph.goal_angle + math.pi) % (2 * math.pi) - math.pi).abs() - graph.epsilon
+    paid = []
+    for problem, arm in zip(graph.problem.tolist(), graph.arm.tolist(), strict=True):
+        who = torch.full((1, count), -1.0)
+        who[0, arm] = 1.0
+        action = torch.cat([torch.ones(1, 1), who, who, torch.zeros(1, 2)], -1)
+        one = slice(problem, problem + 1)
+        rules = Rules(made.rules.cell.take(torch.tensor([problem])), made.rules.config)
+        paid.append(float(rules.step(start[one], goal[one], previous[one], action).reward))
+    able, sure = graph.reaches_object, close.abs() > 1e-4
+    assert 0 < (earned[able] == reward.success).sum() < able.sum()
+    np.testing.assert_array_equal(earned[able & sure].numpy(), torch.tensor(paid)[able & sure].numpy())
+
+
 def test_one_seed_makes_one_run_and_another_another(small, table, tmp_path):
     runs = {}
     for name, seed in (("one", 1), ("same", 1), ("other", 2)):
