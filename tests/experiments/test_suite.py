@@ -42,7 +42,7 @@ def suite(tmp_path) -> Suite:
 
 
 def test_seven_suites_are_shipped():
-    assert SHIPPED == ["ablations", "engines", "many_arms", "paper", "paper_steps", "seeds", "variants"]
+    assert SHIPPED == ["ablations", "charts", "engines", "many_arms", "paper", "paper_steps", "seeds", "variants"]
 
 
 @pytest.mark.parametrize("name", SHIPPED)
