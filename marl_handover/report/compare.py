@@ -191,6 +191,8 @@ def make_figures(results: Tree) -> Iterator[tuple[str, Figure | None]]:
         "arms": arms_figure,
         "workspace": lambda results, spec: workspace_figure(build_cell(CellConfig())),
     }
+    plain = [{**row, "label": row["label"].replace("`", "")} for row in results["rows"]]  # tables are Markdown, pictures are not
+    results = {**results, "rows": plain}
     for spec in results["figures"]:
         yield spec["name"], makers[spec["kind"]](results, spec)
 
