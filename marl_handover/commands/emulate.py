@@ -14,7 +14,9 @@ _SHARED_S = 0.002
 """So long the others wait for the turn of a board at which nothing happens: replies are to come in time."""
 
 if TYPE_CHECKING:
-    from marl_handover.hardware.emulator.device import EmulatedDevice
+    from collections.abc import Mapping
+
+    from marl_handover.hardware.emulator.device import SerialDevice
     from marl_handover.hardware.emulator.pty import PtyEmulator
 
 
@@ -47,7 +49,7 @@ def run(config: EmulateConfig) -> int:
     before = {number: signal.signal(number, lambda number, _: stopped.append(number)) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         for emulator in emulators:
-            print(f"{emulator.device.board.firmware.text} at {emulator.link}, {emulator.device.baud} baud; Ctrl-C ends it", flush=True)
+            print(f"{emulator.device.title} at {emulator.link}, {emulator.device.baud} baud; Ctrl-C ends it", flush=True)
         while not stopped:
             for emulator in emulators:
                 emulator.turn(idle_s)
@@ -77,23 +79,41 @@ def _served(config: EmulateConfig) -> list[PtyEmulator]:
     return emulators
 
 
-def _devices(config: EmulateConfig) -> dict[str, EmulatedDevice]:
-    """The boards that are asked for, with their servos where a lab puts the arms before switching on."""
+def _devices(config: EmulateConfig) -> Mapping[str, SerialDevice]:
+    """The boards that are asked for, or all."""
+    require_seed(config.hardware.emulator.seed)
+    if config.board:
+        require_choice("board", config.board, tuple(config.hardware.boards))
+    config.hardware.validate()
+    devices = _buses(config) if config.hardware.protocol == "feetech" else _boards(config)
+    if config.board and config.board not in devices:
+        raise InvalidSetting("board", config.board, f"one that an arm is wired to: {', '.join(devices)}")
+    return {name: device for name, device in devices.items() if config.board in ("", name)}
+
+
+def _boards(config: EmulateConfig) -> Mapping[str, SerialDevice]:
+    """Boards with their servos where a lab puts the arms before switching on."""
     from marl_handover.cell.build import build_cell, cell_config
     from marl_handover.config import MotionConfig
     from marl_handover.hardware.emulator.device import EmulatedCell, parse_faults
     from marl_handover.motion.home import parked_poses
 
-    require_seed(config.hardware.emulator.seed)
-    if config.board:
-        require_choice("board", config.board, tuple(config.hardware.boards))
     faults = parse_faults(config.faults)
-    config.hardware.validate()
     model = build_cell(cell_config("paper"))  # joint limits and parked pose are the robot's, wherever it stands
     cell = EmulatedCell(config.hardware.for_arms(), model.arm, parked_poses(model, MotionConfig())[0])
-    if config.board and config.board not in cell.devices:
-        raise InvalidSetting("board", config.board, f"one that an arm is wired to: {', '.join(cell.devices)}")
-    served = {name: device for name, device in cell.devices.items() if config.board in ("", name)}
-    for device in served.values():
-        device.add_faults(faults)
-    return served
+    for name, device in cell.devices.items():
+        if config.board in ("", name):
+            device.add_faults(faults)
+    return cell.devices
+
+
+def _buses(config: EmulateConfig) -> Mapping[str, SerialDevice]:
+    """Buses of servos that stand in the middle of their travel, limp."""
+    from marl_handover.hardware.emulator.sts3215 import emulated_buses, parse_servo_faults
+
+    faults = parse_servo_faults(config.faults)
+    buses = emulated_buses(config.hardware.for_arms())
+    for name, bus in buses.items():
+        if config.board in ("", name):
+            bus.add_faults(faults)
+    return buses

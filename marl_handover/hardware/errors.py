@@ -97,6 +97,34 @@ class BadReply(DeviceError):
         super().__init__(f"{asked} was answered by {reply[:32]!r}: expected {wanted}")
 
 
+class ServoMissing(DeviceError):
+    """Servos on a bus do not answer."""
+
+    def __init__(self, bus: str, servos: Iterable[int], present: Iterable[int] | None = None) -> None:
+        self.bus, self.servos = bus, tuple(servos)
+        found = "" if present is None else f"; answering: {', '.join(map(str, present)) or 'none'}"
+        super().__init__(
+            f"bus {bus}: no answer from servo {', '.join(map(str, self.servos))}{found}; check the supply, the cable between the servo and "
+            "the one before it, its id and its baud rate"
+        )
+
+
+class DuplicateServo(DeviceError):
+    """Two servos on one bus have one id."""
+
+    def __init__(self, asked: str, servo: int) -> None:
+        self.servo = servo
+        super().__init__(f"{asked}: servo {servo} answered twice: two servos on this bus have that id; give one of them another")
+
+
+class ServoFault(DeviceError):
+    """A servo answers, and reports trouble."""
+
+    def __init__(self, bus: str, servo: int, what: str) -> None:
+        self.bus, self.servo, self.what = bus, servo, what
+        super().__init__(f"bus {bus}: servo {servo} reports {what.lower()}; an overload ends when its torque is switched off")
+
+
 class BoardReset(DeviceError):
     """The board has forgotten its servos: it was reset, most likely by a supply that broke down under load."""
 

@@ -26,6 +26,7 @@ TIME_MS = (1, 65535)
 BAUDS = (115200, 38400, 9600, 2400)
 """Rates of the boards' jumpers or button; 9600 is what an SSC-32U comes with, 115200 is what stopping in time needs."""
 
+PROTOCOLS = ("ssc32", "feetech")
 FIRST_MOVES = ("ask", "refuse")
 ON_DISCONNECT = ("hold", "limp", "park")
 TWIN = "twin"
@@ -166,6 +167,7 @@ class HardwareConfig:
     """
 
     name: str = name_field("lynxmotion")  # its calibration is kept in a folder of this name
+    protocol: str = chosen("ssc32", PROTOCOLS)  # what boards speak: ssc32, or feetech: a bus of servos each, channels are their ids
     boards: dict[str, BoardConfig] = field(default_factory=lambda: {"main": BoardConfig()})
     arms: dict[str, ArmWiring] = field(default_factory=_pair)
     nominal: dict[str, ServoNominal] = field(default_factory=_nominal)

@@ -9,6 +9,7 @@ import re
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,14 +58,22 @@ class Fault:
         return self.start_s <= t_s < self.end_s
 
 
-def make_fault(kind: str, start_s: float, duration_s: float | None = None, amount: float | None = None) -> Fault:
-    """A fault, with the kind's usual amount and duration where none is given. Raises :class:`UnknownChoice` for an unknown kind."""
-    require_choice("fault", kind, tuple(KINDS))
+def make_fault(
+    kind: str,
+    start_s: float,
+    duration_s: float | None = None,
+    amount: float | None = None,
+    *,
+    kinds: Mapping[str, str] = KINDS,
+    usual: Mapping[str, float] = _USUAL,
+) -> Fault:
+    """A fault of one of ``kinds``, with its usual amount and duration where none is given. Raises :class:`UnknownChoice` for another."""
+    require_choice("fault", kind, tuple(kinds))
     lasting = (0.0 if kind == "brownout" else math.inf) if duration_s is None else duration_s
-    return Fault(kind, start_s, lasting, _USUAL.get(kind, 0.0) if amount is None else amount)
+    return Fault(kind, start_s, lasting, usual.get(kind, 0.0) if amount is None else amount)
 
 
-def parse_faults(text: str) -> list[Fault]:
+def parse_faults(text: str, *, kinds: Mapping[str, str] = KINDS, usual: Mapping[str, float] = _USUAL) -> list[Fault]:
     """Faults of a text ``kind@start[:duration][=amount]``, separated by commas; times in s.
 
     Raises :class:`UnknownChoice` for an unknown kind and :class:`BadOverride` for what cannot be read.
@@ -80,7 +89,7 @@ def parse_faults(text: str) -> list[Fault]:
             raise BadOverride(f"faults={item}", "expected kind@start[:duration][=amount], such as unplug@5:1.5") from None
         if any(number is not None and not (math.isfinite(number) and number >= 0) for number in numbers):
             raise BadOverride(f"faults={item}", "times and amounts are finite and not negative")
-        faults.append(make_fault(kind, numbers[0] or 0.0, numbers[1], numbers[2]))
+        faults.append(make_fault(kind, numbers[0] or 0.0, numbers[1], numbers[2], kinds=kinds, usual=usual))
     return faults
 
 
@@ -91,6 +100,49 @@ _ANSWER_S, _REPLY_DELAY_S, _BYTE_GAP_S = 100e-6, 1e-6 * 600, 1e-6 * 70
 """How long the board thinks, and, as it is delivered, waits before a reply and between its bytes."""
 
 _POWER = ("brownout", "silent")
+
+
+class SerialDevice(Protocol):
+    """What can be behind a serial port. All times are in s on one clock, and never go back."""
+
+    host_baud: int
+    """What the computer has set its port to."""
+
+    baud: int
+    unplugged: int
+    """How many times the cable came out; a port that was open then is dead, even if the cable is back."""
+
+    lines: deque[tuple[float, bytes]]
+    """The last lines, or packets, that came in, and when each ended."""
+
+    @property
+    def title(self) -> str:
+        """What it is, in a few words."""
+
+    @property
+    def plugged(self) -> bool:
+        """Whether the port is there, at the time the device was last advanced to."""
+
+    def write(self, data: bytes, t_s: float) -> None:
+        """Bytes from the computer."""
+
+    def read(self, t_s: float, size: int | None = None) -> bytes:
+        """Up to ``size`` bytes that have come back by ``t_s``; all of them without ``size``."""
+
+    def waiting(self, t_s: float) -> int:
+        """Number of bytes that have come back and were not read."""
+
+    def next_event_s(self) -> float | None:
+        """When something may happen next that the computer could notice; None if nothing is under way."""
+
+    def sending_until_s(self) -> float:
+        """When the last byte written will have arrived."""
+
+    def forget_input(self) -> None:
+        """Throw away what has come back."""
+
+    def advance(self, t_s: float) -> None:
+        """Let everything happen up to ``t_s``, in order."""
 
 
 class EmulatedDevice:
@@ -131,6 +183,11 @@ class EmulatedDevice:
                 end_s = fault.end_s + (self.boot_s if fault.kind in _POWER else 0.0)
                 heapq.heappush(self._edges, (end_s, len(self._faults), False, fault))
         self.advance(self._now_s)
+
+    @property
+    def title(self) -> str:
+        """Its firmware's own name."""
+        return self.board.firmware.text
 
     @property
     def plugged(self) -> bool:

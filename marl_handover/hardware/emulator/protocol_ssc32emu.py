@@ -1,4 +1,4 @@
-"""The pyserial URL scheme ``ssc32emu://name``: a mounted :class:`EmulatedDevice` as a serial port inside the process.
+"""The pyserial URL scheme ``ssc32emu://name``: a mounted :class:`SerialDevice` as a serial port inside the process.
 
 pyserial finds this module by its name, in a package of ``serial.protocol_handler_packages``. Reads and writes fail as those of a real port
 whose cable comes out: a read and a write with ``SerialException``, ``in_waiting`` with a bare ``OSError``, flushing with ``termios.error``,
@@ -15,18 +15,18 @@ from serial import PortNotOpenError, SerialException, SerialTimeoutException
 from serial.serialutil import SerialBase
 
 from marl_handover.hardware.clock import Clock
-from marl_handover.hardware.emulator.device import BITS_PER_BYTE, EmulatedDevice
+from marl_handover.hardware.emulator.device import BITS_PER_BYTE, SerialDevice
 from marl_handover.hardware.errors import FlushFailed
 
 SCHEME = "ssc32emu://"
 BUFFER_BYTES = 4096
 """What the operating system takes before a write has to wait."""
 
-_mounted: dict[str, tuple[EmulatedDevice, Clock]] = {}
-_in_use: WeakKeyDictionary[EmulatedDevice, Serial] = WeakKeyDictionary()
+_mounted: dict[str, tuple[SerialDevice, Clock]] = {}
+_in_use: WeakKeyDictionary[SerialDevice, Serial] = WeakKeyDictionary()
 
 
-def mount(name: str, device: EmulatedDevice, clock: Clock) -> str:
+def mount(name: str, device: SerialDevice, clock: Clock) -> str:
     """Make ``device`` the one behind ``ssc32emu://name``; the URL. A device that was there before is replaced."""
     _mounted[name] = device, clock
     return SCHEME + name

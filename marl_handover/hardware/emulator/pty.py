@@ -13,9 +13,9 @@ from pathlib import Path
 from marl_handover.errors import InvalidSetting
 from marl_handover.files import temporary_of
 from marl_handover.hardware.clock import Clock, RealClock
-from marl_handover.hardware.emulator.device import EmulatedDevice
+from marl_handover.hardware.emulator.device import SerialDevice
 
-_RATES = {getattr(termios, f"B{baud}"): baud for baud in (2400, 9600, 38400, 57600, 115200)}
+_RATES = {getattr(termios, f"B{baud}"): baud for baud in (2400, 9600, 38400, 57600, 115200, 500000, 1000000)}
 IDLE_S = 0.02
 """So long a turn waits at most for something to do."""
 
@@ -32,7 +32,7 @@ class PtyEmulator:
         InvalidSetting: something else than a symlink is in the place of ``link``, or it cannot be written.
     """
 
-    def __init__(self, device: EmulatedDevice, link: Path | str, clock: Clock | None = None) -> None:
+    def __init__(self, device: SerialDevice, link: Path | str, clock: Clock | None = None) -> None:
         self.device, self.link = device, Path(link)
         self._clock: Clock = clock or RealClock()
         self._zero_s = self._clock.now_s()
