@@ -1,7 +1,7 @@
 # Needs Linux, make and Python 3.11, 3.12 or 3.13 with venv and pip; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-pythons test-lowest fuzz check format bench docs pretrained wheel clean
+.PHONY: help demo test test-slow test-pythons test-lowest test-clients fuzz check format bench docs pretrained wheel clean
 
 VERSIONS := 3.11 3.12 3.13
 SUITABLE := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
@@ -26,6 +26,7 @@ help:
 	@echo "make test-pythons the tests with every other Python that fits and is here; TESTS=tests/cell names some of them"
 	@echo "make fuzz       20,000 random command lines over every key of every command, in one process (an hour or two)"
 	@echo "make test-lowest the tests with the lowest versions that pyproject.toml allows, in .venv-lowest"
+	@echo "make test-clients other people's programs drive the emulated bus servos, in .venv-clients"
 	@echo "make check      style, types and import layers; make format repairs the style"
 	@echo "make bench      measure motion planning, the safety gate, speed, and learning against Stable-Baselines3 (hours)"
 	@echo "make docs       build the documentation site into site/; warnings are errors"
@@ -62,7 +63,15 @@ $(if $(2),$(MAKE) test VENV=.venv-$(1) PYTHON=$(2),@echo "make: no Python $(1) h
 endef
 
 test-slow: $(STAMP)
-	$(ONE_THREAD) $(BIN)/python $(PYTEST) --timeout 1800 -m "slow and not gpu and not hardware"
+	$(ONE_THREAD) $(BIN)/python $(PYTEST) --timeout 1800 -m "slow and not gpu and not hardware and not clients"
+
+# Programs that others wrote for bus servos drive the emulated ones; two of them have one import name.
+CLIENTS := vendor=ftservo-python-sdk==2.0.1 lerobot_sdk=feetech-servo-sdk==1.0.0 rustypot=rustypot==1.13.1
+name_of = $(word 1,$(subst =, ,$(1)))
+
+test-clients: $(STAMP)
+	$(foreach c,$(CLIENTS),$(BIN)/python -m venv --clear .venv-clients/$(call name_of,$(c)) && .venv-clients/$(call name_of,$(c))/bin/python -m pip install --quiet --disable-pip-version-check pyserial $(patsubst $(call name_of,$(c))=%,%,$(c)) &&) true
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -m clients tests/hardware/test_emulate_servos.py
 
 fuzz: $(STAMP)
 	$(ONE_THREAD) $(BIN)/python tests/fuzz_command_lines.py 20000

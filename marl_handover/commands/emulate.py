@@ -10,9 +10,6 @@ from marl_handover.config import path_field, require_choice, require_seed
 from marl_handover.errors import InvalidSetting, WorkFailed
 from marl_handover.hardware.settings import HardwareConfig
 
-_SHARED_S = 0.002
-"""So long the others wait for the turn of a board at which nothing happens: replies are to come in time."""
-
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -39,20 +36,19 @@ GROUPS: dict[str, dict[str, type]] = {}
 def run(config: EmulateConfig) -> int:
     """Serve until Ctrl-C or SIGTERM, which is how it is meant to end: 0 then."""
     try:
-        from marl_handover.hardware.emulator.pty import IDLE_S
+        from marl_handover.hardware.emulator.pty import turn
     except ImportError as error:
         raise WorkFailed(f"emulate needs pseudo-terminals, which this system does not have ({error})") from error
 
     emulators = _served(config)
-    idle_s = IDLE_S if len(emulators) == 1 else _SHARED_S
     stopped: list[int] = []
     before = {number: signal.signal(number, lambda number, _: stopped.append(number)) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         for emulator in emulators:
             print(f"{emulator.device.title} at {emulator.link}, {emulator.device.baud} baud; Ctrl-C ends it", flush=True)
         while not stopped:
+            turn(emulators)
             for emulator in emulators:
-                emulator.turn(idle_s)
                 while config.lines and emulator.device.lines:
                     t_s, line = emulator.device.lines.popleft()
                     print(f"{t_s:10.4f} s  {line.decode('ascii', 'backslashreplace').rstrip()}", flush=True)
@@ -109,7 +105,7 @@ def _boards(config: EmulateConfig) -> Mapping[str, SerialDevice]:
 
 def _buses(config: EmulateConfig) -> Mapping[str, SerialDevice]:
     """Buses of servos that stand in the middle of their travel, limp."""
-    from marl_handover.hardware.emulator.sts3215 import emulated_buses, parse_servo_faults
+    from marl_handover.hardware.emulator.servo_bus import emulated_buses, parse_servo_faults
 
     faults = parse_servo_faults(config.faults)
     buses = emulated_buses(config.hardware.for_arms())

@@ -87,6 +87,7 @@ def open_devices(config: WorkcellConfig, model: CellModel, motion: MotionConfig,
         InvalidSetting, UnknownChoice: a setting is out of its limits, or an arm of the cell is not wired.
         NoCamera: the camera is not there.
     """
+    config.hardware.require_boards()
     config.validate(model.cell.names)
     if config.emulated:
         twin = Twin(model, motion, config)
@@ -113,6 +114,7 @@ def open_workcell(
         NoCamera: the camera is not there.
         InvalidSetting, UnknownChoice: a setting is out of its limits, or an arm of the cell is not wired.
     """
+    config.hardware.require_boards()
     wired = config.hardware.for_arms(model.cell.names)
     folder = config.folder()
     seen_by = camera_calibration(folder)

@@ -33,9 +33,6 @@ COUNTS = 4096
 MODEL = 777
 """What an STS3215 says it is."""
 
-BAUDS = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
-"""By the value of the register ``baud_rate``."""
-
 
 class Status(IntFlag):
     """What a servo reports with every reply."""

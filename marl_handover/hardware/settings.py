@@ -26,6 +26,9 @@ TIME_MS = (1, 65535)
 BAUDS = (115200, 38400, 9600, 2400)
 """Rates of the boards' jumpers or button; 9600 is what an SSC-32U comes with, 115200 is what stopping in time needs."""
 
+SERVO_BAUDS = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
+"""Rates of bus servos, by the value of their register."""
+
 PROTOCOLS = ("ssc32", "feetech")
 FIRST_MOVES = ("ask", "refuse")
 ON_DISCONNECT = ("hold", "limp", "park")
@@ -219,6 +222,11 @@ class HardwareConfig:
         self._check_plugs(wanted)
         return replace(self, arms={name: self.arms[name] for name in wanted})
 
+    def require_boards(self) -> None:
+        """Raise :class:`InvalidSetting` for servos on a bus: what drives arms speaks to boards alone so far."""
+        if self.protocol != "ssc32":
+            raise InvalidSetting("hardware.protocol", self.protocol, "'ssc32': bus servos are emulated, and driven by FeetechBus, alone")
+
     def require_grip(self, pin_diameter_mm: float) -> None:
         """Raise :class:`InvalidSetting` for fingers that would close to their end, whatever is between them: that strips gears."""
         for name, wiring in self.arms.items():
@@ -241,8 +249,9 @@ class HardwareConfig:
         ports: dict[str, str] = {}
         for board in dict.fromkeys(self.arms[name].board for name in names):
             baud, port = self.boards[board].baud, self.boards[board].port
-            if baud not in BAUDS:
-                raise InvalidSetting(f"hardware.boards.{board}.baud", baud, f"one of {', '.join(map(str, BAUDS))}")
+            bauds = BAUDS if self.protocol == "ssc32" else SERVO_BAUDS
+            if baud not in bauds:
+                raise InvalidSetting(f"hardware.boards.{board}.baud", baud, f"one of {', '.join(map(str, bauds))}")
             if port and port in ports:
                 raise InvalidSetting(f"hardware.boards.{board}.port", port, f"another port than that of board {ports[port]}")
             ports[port] = board

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from marl_handover.hardware import feetech
 from marl_handover.hardware.emulator.device import parse_faults
-from marl_handover.hardware.emulator.sts3215 import EmulatedBus, Sts3215, Sts3215Truth, parse_servo_faults
+from marl_handover.hardware.emulator.servo_bus import EmulatedBus, parse_servo_faults
+from marl_handover.hardware.emulator.sts3215 import Sts3215, Sts3215Truth
 from marl_handover.hardware.feetech import REGISTERS, Status
 
 BYTE_S = 1e-5

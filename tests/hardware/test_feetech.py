@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from marl_handover.hardware import feetech
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.emulator.protocol_ssc32emu import mount
-from marl_handover.hardware.emulator.sts3215 import EmulatedBus, Sts3215, parse_servo_faults
+from marl_handover.hardware.emulator.servo_bus import EmulatedBus, parse_servo_faults
+from marl_handover.hardware.emulator.sts3215 import Sts3215
 from marl_handover.hardware.errors import (
     BadCommand,
     BadReply,

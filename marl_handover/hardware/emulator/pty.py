@@ -7,7 +7,7 @@ import os
 import select
 import termios
 import tty
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from marl_handover.errors import InvalidSetting
@@ -49,20 +49,23 @@ class PtyEmulator:
     def serve(self, until: Callable[[], bool]) -> None:
         """Pass bytes on until ``until`` says True; it is asked at least every 20 ms."""
         while not until():
-            self.turn()
+            turn([self])
 
-    def turn(self, idle_s: float = IDLE_S) -> None:
-        """Wait for the next thing to do, ``idle_s`` at most, and do it."""
+    def wait_s(self) -> float:
+        """How long nothing is to be done, 20 ms at most, unless bytes come in."""
         next_s = self.device.next_event_s()
-        wait_s = idle_s if next_s is None else min(idle_s, max(0.0, next_s - self.now_s()))
-        if self._master >= 0:
-            ready, _, _ = select.select([self._master], [], [], wait_s)
-            data = os.read(self._master, 4096) if ready else b""
-            if data:
-                self.device.host_baud = _RATES.get(termios.tcgetattr(self._slave)[5], 0) or self.device.baud
-                self.device.write(data, self.now_s())
-        else:
-            self._clock.sleep_s(wait_s)
+        return IDLE_S if next_s is None else min(IDLE_S, max(0.0, next_s - self.now_s()))
+
+    def fileno(self) -> int:
+        """Of the master's side; -1 while the cable is out."""
+        return self._master
+
+    def pass_on(self, ready: bool) -> None:
+        """Take what has come in, if bytes are ``ready``, and hand over what has come back."""
+        data = os.read(self._master, 4096) if ready else b""
+        if data:
+            self.device.host_baud = _RATES.get(termios.tcgetattr(self._slave)[5], 0) or self.device.baud
+            self.device.write(data, self.now_s())
         self.device.advance(self.now_s())
         self._follow_plug()
         reply = self.device.read(self.now_s())
@@ -100,3 +103,10 @@ class PtyEmulator:
         except OSError as error:
             self.close()
             raise InvalidSetting("link", str(self.link), f"a path that can be written ({error.strerror or error})") from error
+
+
+def turn(emulators: Sequence[PtyEmulator]) -> None:
+    """Wait for the next thing to do at any of them, 20 ms at most, and do it."""
+    ready, _, _ = select.select([each for each in emulators if each.fileno() >= 0], [], [], min(each.wait_s() for each in emulators))
+    for each in emulators:
+        each.pass_on(each in ready)
