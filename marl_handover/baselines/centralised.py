@@ -277,7 +277,7 @@ class CentralisedSac(HybridSac):
         """A branch, a place and a motion drawn from the policy."""
         decision = super().explore(observation)
         exploring = torch.arange(len(observation), device=self.device) >= int(self.config.deterministic_env_fraction * len(observation))
-        noise = self._noise((len(observation), self.count)) * exploring[:, None]
+        noise = self._gaussian((len(observation), self.count)) * exploring[:, None]
         return self.loss.actor.with_motion(observation, decision, noise)
 
     @torch.no_grad()
@@ -291,11 +291,11 @@ class CentralisedSac(HybridSac):
         """One step of the critics, the actor, the temperatures and the target."""
         present, following = with_actions(batch)
         shape = (len(batch), self.loss.noise_width)
-        critic_loss = self._critic_loss(present, following, self._noise(shape))
+        critic_loss = self._critic_loss(present, following, self._gaussian(shape))
         stepped(self.critic_optimizer, critic_loss)
         tried = (int(len(batch) * self.config.candidate_share), self.rules.cell.num_arms, self.config.candidates, 2)
         self.loss.critic.requires_grad_(False)
-        actor_loss, branch, place, motion = self._actor_loss(present, self._noise(shape), self._anywhere(tried), self._nearby(tried))
+        actor_loss, branch, place, motion = self._actor_loss(present, self._gaussian(shape), self._anywhere(tried), self._nearby(tried))
         stepped(self.actor_optimizer, actor_loss)
         self.loss.critic.requires_grad_(True)
         targets = torch.tensor([*self.targets, self.motion_target], device=self.device)

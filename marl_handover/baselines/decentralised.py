@@ -311,7 +311,7 @@ class DecentralisedSac(HybridSac):
         exploring = torch.arange(len(observation), device=self.device) >= int(self.config.deterministic_env_fraction * len(observation))
         needed = (observation[:, REACHES] > 0) & (observation[:, OWN + 1] > 0)
         branches.logits[:, 0, PASS] -= torch.where(needed, torch.inf, 0.0)
-        place, _ = squashed_sample(branches, self._noise(branches.mean.shape) * exploring[:, None, None, None])
+        place, _ = squashed_sample(branches, self._gaussian(branches.mean.shape) * exploring[:, None, None, None])
         uniform = self._uniform(branches.logits.flatten(1).shape)
         gumbel = -(-uniform.clamp_min(1e-20).log()).log()
         anywhere = self._uniform(place.shape[:-1]) < self.config.random_place
@@ -331,13 +331,13 @@ class DecentralisedSac(HybridSac):
         rows = [loss.unpacked(batch[number::stride]) for number, (loss, _, _) in enumerate(self.parts)]
         count = len(batch) // stride
         shape = (count, 1, self.config.mixture_components, 2)
-        critic = [lossy(*both, self._noise(shape)) for (_, lossy, _), both in zip(self.parts, rows, strict=True)]
+        critic = [lossy(*both, self._gaussian(shape)) for (_, lossy, _), both in zip(self.parts, rows, strict=True)]
         critic_loss = torch.stack(critic).sum()
         stepped(self.critic_optimizer, critic_loss)
         tried = (int(count * self.config.candidate_share), 1, self.config.candidates, 2)
         self.critics.requires_grad_(False)
         acted = [
-            lossy(present, self._noise(shape), self._anywhere(tried), self._nearby(tried))
+            lossy(present, self._gaussian(shape), self._anywhere(tried), self._nearby(tried))
             for (_, _, lossy), (present, _) in zip(self.parts, rows, strict=True)
         ]
         actor_loss = torch.stack([loss for loss, _, _ in acted]).sum()

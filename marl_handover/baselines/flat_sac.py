@@ -91,7 +91,7 @@ class FlatSac(Algorithm):
     @torch.no_grad()
     def explore(self, observation: Tensor) -> Tensor:
         """An action drawn from the policy."""
-        return self.loss.drawn(observation, self._noise((len(observation), self.rules.action_size)))[0]
+        return self.loss.drawn(observation, self._noise(len(observation)))[0]
 
     @torch.no_grad()
     def act(self, observation: Tensor) -> Tensor:
@@ -102,11 +102,10 @@ class FlatSac(Algorithm):
         """One step of the values, the actor, the temperature and the target."""
         seen, following = batch["observation"], batch["next"]
         earned = following["reward"][:, 0], following["terminated"][:, 0]
-        shape = (len(batch), self.rules.action_size)
-        value_loss = self._value_loss(seen, batch["action"], *earned, following["observation"], self._noise(shape))
+        value_loss = self._value_loss(seen, batch["action"], *earned, following["observation"], self._noise(len(batch)))
         stepped(self.value_optimizer, value_loss)
         self.loss.value.requires_grad_(False)
-        actor_loss, entropy = self._actor_loss(seen, self._noise(shape))
+        actor_loss, entropy = self._actor_loss(seen, self._noise(len(batch)))
         stepped(self.actor_optimizer, actor_loss)
         self.loss.value.requires_grad_(True)
         stepped(self.temperature_optimizer, self.loss.log_temperature * (entropy + self.rules.action_size))
@@ -118,3 +117,6 @@ class FlatSac(Algorithm):
             "temperature_place": self.loss.log_temperature.detach().exp(),
             "entropy_place": entropy,
         }
+
+    def _noise(self, count: int) -> Tensor:
+        return self._gaussian((count, self.rules.action_size))

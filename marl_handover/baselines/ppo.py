@@ -67,7 +67,7 @@ class Ppo(Algorithm):
         """An action drawn from the policy."""
         loc, scale = NormalParamExtractor()(self.net(observation))
         # Kept off the walls of the box, where the density of a tanh-Gaussian is not finite.
-        noise = self._noise(loc.shape)
+        noise = self._gaussian(loc.shape)
         return (loc + scale * noise).tanh().clamp(-1 + 1e-6, 1 - 1e-6)
 
     @torch.no_grad()

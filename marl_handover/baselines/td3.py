@@ -92,7 +92,7 @@ class Td3(Algorithm):
     def explore(self, observation: Tensor) -> Tensor:
         """The policy's action with Gaussian noise, or a uniform one."""
         action = self.act(observation)
-        noise = self._noise(action.shape) * self.config.exploration_std
+        noise = self._gaussian(action.shape) * self.config.exploration_std
         uniform = self.random_action(observation)
         random = self._uniform((len(action), 1)) < self.config.random_action
         return torch.where(random, uniform, (action + noise).clamp(-1, 1))

@@ -170,9 +170,9 @@ class HardwareConfig:
     """
 
     name: str = name_field("lynxmotion")  # its calibration is kept in a folder of this name
-    protocol: str = chosen("ssc32", PROTOCOLS)  # what boards speak: ssc32, or feetech: a bus of servos each, channels are their ids
     boards: dict[str, BoardConfig] = field(default_factory=lambda: {"main": BoardConfig()})
     arms: dict[str, ArmWiring] = field(default_factory=_pair)
+    protocol: str = chosen("ssc32", PROTOCOLS)  # what boards speak: ssc32, or feetech: a bus of servos each, channels are their ids
     nominal: dict[str, ServoNominal] = field(default_factory=_nominal)
     gate: SafetyFilterConfig = field(default_factory=SafetyFilterConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)

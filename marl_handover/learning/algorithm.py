@@ -189,7 +189,7 @@ class Algorithm(ABC):
     def _uniform(self, shape: tuple[int, ...]) -> Tensor:
         return torch.rand(shape, generator=self.generator, device=self.device)
 
-    def _noise(self, shape: tuple[int, ...]) -> Tensor:
+    def _gaussian(self, shape: tuple[int, ...]) -> Tensor:
         return torch.randn(shape, generator=self.generator, device=self.device)
 
 

@@ -234,7 +234,7 @@ class GraphSac(Algorithm):
 
     def _sampled(self, graph: HandoverGraphs, embedding: Tensor, features: Tensor) -> Sampled:
         mean, log_std = best_places(self.network.layers, self.shape, graph, embedding, features)
-        place, log_prob = squashed(mean, log_std, self._noise(mean.shape))
+        place, log_prob = squashed(mean, log_std, self._gaussian(mean.shape))
         return Sampled(place, log_prob, mean.tanh())
 
     def _value(self, layers: Layers, graph: HandoverGraphs, embedding: Tensor, place: Tensor, edge: Tensor | None = None) -> Tensor:
@@ -257,7 +257,7 @@ class GraphSac(Algorithm):
 
     def _nearby(self, shape: tuple[int, ...]) -> Tensor:
         """Offsets of sizes from a hundredth to a third."""
-        return 10 ** -(0.5 + 1.5 * self._uniform(shape)) * self._noise(shape)
+        return 10 ** -(0.5 + 1.5 * self._uniform(shape)) * self._gaussian(shape)
 
     def _gumbel(self, shape: tuple[int, ...]) -> Tensor:
         return -(-self._uniform(shape).clamp_min(1e-20).log()).clamp_min(1e-20).log()

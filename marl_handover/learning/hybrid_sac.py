@@ -254,7 +254,7 @@ class HybridSac(Algorithm):
         branches = self.loss.actor(observation)
         # Some cells follow the deterministic policy: where that goes in circles, its states must get into the memory.
         exploring = torch.arange(len(observation), device=self.device) >= int(self.config.deterministic_env_fraction * len(observation))
-        place, _ = squashed_sample(branches, self._noise(branches.mean.shape) * exploring[:, None, None, None])
+        place, _ = squashed_sample(branches, self._gaussian(branches.mean.shape) * exploring[:, None, None, None])
         uniform = self._uniform(branches.logits.flatten(1).shape)
         gumbel = -(-uniform.clamp_min(1e-20).log()).log()
         anywhere = self._uniform(place.shape[:-1]) < self.config.random_place
@@ -272,12 +272,12 @@ class HybridSac(Algorithm):
         """One step of the critics, the actor, the temperatures and the target."""
         present, following = unpacked(batch)
         shape = (len(batch), self.rules.cell.num_arms, self.config.mixture_components, 2)
-        critic_loss = self._critic_loss(present, following, self._noise(shape))
+        critic_loss = self._critic_loss(present, following, self._gaussian(shape))
         stepped(self.critic_optimizer, critic_loss)
         tried = (int(shape[0] * self.config.candidate_share), shape[1], self.config.candidates, 2)
         self.loss.critic.requires_grad_(False)
         actor_loss, branch_entropy, place_entropy = self._actor_loss(
-            present, self._noise(shape), self._anywhere(tried), self._nearby(tried)
+            present, self._gaussian(shape), self._anywhere(tried), self._nearby(tried)
         )
         stepped(self.actor_optimizer, actor_loss)
         self.loss.critic.requires_grad_(True)
@@ -300,4 +300,4 @@ class HybridSac(Algorithm):
 
     def _nearby(self, shape: tuple[int, ...]) -> Tensor:
         """Offsets in the chart, of sizes from a hundredth to a third."""
-        return 10 ** -(0.5 + 1.5 * self._uniform((*shape[:-1], 1))) * self._noise(shape)
+        return 10 ** -(0.5 + 1.5 * self._uniform((*shape[:-1], 1))) * self._gaussian(shape)

@@ -43,7 +43,7 @@ def same(one, other):
 
 
 def noise_of(learner, batch):
-    return learner._noise((len(batch), 2, learner.config.mixture_components, 2))
+    return learner._gaussian((len(batch), 2, learner.config.mixture_components, 2))
 
 
 def critic_loss(learner, batch, **changed):
