@@ -1,6 +1,6 @@
 """Motion planning in numbers, on the committed transfers: ours, the paper's program, OMPL, toppra, cycles, the first plan.
 
-python bench/motion.py rows=1000 every=50 cycles=200 starts=true costs=1000 results=bench/results
+python bench/motion.py rows=1000 every=50 cycles=200 starts=true costs=1000 many=200 results=bench/results
 
 ``rows`` of bench/data/transfers.jsonl; the peers get every ``every``-th of them. Times are of the public call, one thread, after a warm-up.
 """
@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import load
 from marl_handover.report.motion import plan_motions
 
-DEFAULTS = {"rows": 1000, "every": 50, "cycles": 200, "starts": True, "costs": 1000, "seed": 0, "results": "bench/results"}
+DEFAULTS = {"rows": 1000, "every": 50, "cycles": 200, "starts": True, "costs": 1000, "many": 200, "seed": 0, "results": "bench/results"}
 FIRST_PLAN = """
 import time
 import numpy as np
@@ -133,6 +134,31 @@ def cycles(planner: MotionPlanner, count: int, seed: int) -> dict[str, Any]:
     return {"cycles": count, **times, "refused": dict(refused)}
 
 
+CELLS = ("al5a", "triangle", "ring6")
+"""A pair of one robot, three and six of it."""
+
+
+def cells(count: int, seed: int) -> dict[str, Any]:
+    """Paths of one cycle, all other arms parked: ``count`` in each of :data:`CELLS`, by turns, so that load hits all alike."""
+    planners = {name: MotionPlanner(build_cell(cell_config(name))) for name in CELLS}
+    places, results = {}, {name: [] for name in CELLS}
+    for name, planner in planners.items():
+        planner.warm_up()
+        places[name] = random_places(planner, count, seed)
+    for number in range(count):
+        for name, planner in planners.items():
+            arm, *ends = places[name][number]
+            parked, others = planner.homes_rad[arm], planner.others_home_rad(arm)
+            results[name].append(timed(partial(planner.plan_paths, arm, *ends, parked, others)))
+    found: dict[str, Any] = {"cycles": count}
+    for name, taken in results.items():
+        times = {"ms": spread([it.ms for it in taken], 2), "cpu_ms": spread([it.cpu_ms for it in taken], 2)}
+        found[name] = {"arms": planners[name].model.cell.num_arms, **times, "refused": sum(isinstance(it.found, NoPath) for it in taken)}
+    for name in CELLS[1:]:
+        found[name]["times_the_pair"] = round(found[name]["cpu_ms"]["median"] / found[CELLS[0]]["cpu_ms"]["median"], 3)
+    return found
+
+
 def first_plans() -> dict[str, Any]:
     """Seconds of a fresh process: of its first transfer, of its first cycle after that, and of all its life, twice with one cache."""
     found = {}
@@ -183,6 +209,7 @@ def measure(values: dict[str, Any]) -> dict[str, Any]:
         "ompl": against_ompl(planner, some),
         "timing": against_toppra(planner, [path.points for path in found[:: values["every"]]]),
         "cycles": cycles(planner, values["cycles"], values["seed"]),
+        "cells": cells(values["many"], values["seed"]) if values["many"] else None,
         "first_plan": first_plans() if values["starts"] else None,
         "path_costs": path_costs(planner, values["costs"], values["seed"]),
     }
@@ -227,6 +254,10 @@ def show(found: dict[str, Any]) -> str:
     rows.append([f"whole cycle, {cycle['cycles']} random ones, ms", words(cycle["ms"])])
     rows.append(["  of a processor, ms", words(cycle["cpu_ms"])])
     rows += [[f"  refused: {reason}", str(count)] for reason, count in cycle["refused"].items()]
+    for name in CELLS if found["cells"] else ():
+        it = found["cells"][name]
+        rows.append([f"paths of a cycle among {it['arms']} arms, {name}, of a processor, ms", words(it["cpu_ms"])])
+        rows += [["  median over that of the pair", f"{it['times_the_pair']:.2f}"]] if "times_the_pair" in it else []
     rows.append(["time saved by overlapping cycles of exact plans", f"{100 * found['overlap']['saved']:.1f} %"])
     for name, it in (first or {}).items():
         rows.append([f"first transfer of a process, {name} cache, s", f"{it['transfer_s']:.2f}"])

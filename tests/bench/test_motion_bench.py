@@ -82,12 +82,16 @@ def test_a_refusal_is_timed_too_and_an_error_is_not_hidden():
 
 def test_the_report_is_written_with_its_settings_and_printed(planner, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(motion, "ROOT", tmp_path)
-    motion.main(["rows=3", "every=2", "cycles=2", "costs=5", "starts=false", "results=here"])
+    motion.main(["rows=3", "every=2", "cycles=2", "costs=5", "starts=false", "many=2", "results=here"])
     (file,) = tmp_path.glob("here/*/motion.json")
     found = json.loads(file.read_text())
-    assert found["settings"] == {**motion.DEFAULTS, "rows": 3, "every": 2, "cycles": 2, "costs": 5, "starts": False, "results": "here"}
+    given = {"rows": 3, "every": 2, "cycles": 2, "costs": 5, "starts": False, "many": 2, "results": "here"}
+    assert found["settings"] == {**motion.DEFAULTS, **given}
+    assert [found["cells"][name]["arms"] for name in motion.CELLS] == [2, 3, 6]
+    assert found["cells"]["ring6"]["times_the_pair"] > 0
     assert (found["transfers"]["rows"], found["paper"]["rows"], found["path_costs"]["transfers"]) == (3, 2, 5)
     assert {"commit", "machine"} <= found.keys()
     text = capsys.readouterr().out
     assert "transfer, 3 rows, ms" in text
     assert "2 random ones" in text
+    assert "among 6 arms, ring6" in text
