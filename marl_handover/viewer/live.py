@@ -30,7 +30,6 @@ from marl_handover.control.remote_control import MAX_AGE_S, SessionCommand
 from marl_handover.control.telemetry_reader import Reading, TelemetryReader
 from marl_handover.errors import HandoverError, counted
 from marl_handover.geometry.se3 import flat_pose, transform
-from marl_handover.hardware.settings import ARMS
 from marl_handover.palette import ALERT, BLUE, GREY, INK, PAPER, YELLOW
 from marl_handover.viewer.scene import CellScene
 from marl_handover.viewer.words import DOING, at_once
@@ -112,8 +111,9 @@ def plan(state: Mapping[str, Any]) -> str:
     steps = state.get("plan") or []
     if not steps:
         return f'<div style="{_SMALL}">nothing planned</div>'
+    names = [arm["name"] for arm in state["arms"]]
     rows = [
-        (f"{number}", f"{ARMS[step['arm']]} arm", "to the goal" if step["final"] else "hand-over", _pose(step["pose"]))
+        (f"{number}", f"{names[step['arm']]} arm", "to the goal" if step["final"] else "hand-over", _pose(step["pose"]))
         for number, step in enumerate(steps, 1)
     ]
     return _table(rows)

@@ -282,3 +282,12 @@ def test_headlines(fields, word):
     state = {"doing": "", "text": "", "over": False, "quiet_s": 0.0, "pausing": False, "arms": [], "phase": ""} | fields
     assert word in live_words.headline(Reading(state, True, "", 0.0))
     assert "gone" in live_words.headline(Reading(state, False, "process 1 is gone", 9.0))
+
+
+def test_hand_overs_to_come_name_any_of_the_arms():
+    state = {
+        "arms": [{"name": name} for name in ("north", "west", "east")],
+        "plan": [{"arm": 2, "final": False, "pose": [1.0, 2.0, 0.5]}, {"arm": 1, "final": True, "pose": [3.0, 4.0, 0.0]}],
+    }
+    shown = live_words.plan(state)
+    assert shown.index("east arm") < shown.index("hand-over") < shown.index("west arm") < shown.index("to the goal")
