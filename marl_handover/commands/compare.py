@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class CompareConfig:
     """Keys of ``compare``."""
 
-    suite: str = path_field("paper")  # paper, paper_steps, variants, ablations, seeds, engines, charts, many_arms, or a YAML file
+    suite: str = path_field("paper")  # paper, paper_steps, variants, ablations, seeds, engines, charts, many_arms, ladder, or a YAML file
     preset: str = "full"  # full or quick, a smoke size
     rows: list[str] = field(default_factory=list)  # some of its rows; []: all
     seeds: int = bounded(0, 0, 1000)  # of every row; 0: as the suite has it; an evaluation that the suite gives fewer keeps to those

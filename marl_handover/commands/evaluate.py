@@ -12,8 +12,10 @@ import numpy as np
 from marl_handover.config import CELL_ALIASES, path_field
 from marl_handover.control.evaluation import AssessmentConfig, assess
 from marl_handover.errors import InvalidSetting, MissingFile, counted
+from marl_handover.experiments.provenance import commit
 from marl_handover.files import write_whole
 from marl_handover.learning.evaluation import Evaluation
+from marl_handover.learning.recorder import machine
 from marl_handover.task.rules import Outcome
 
 
@@ -41,6 +43,8 @@ def run(config: EvaluateCommand) -> int:
     done = assess(config, traced=bool(config.trace), progress=config.progress)
     print(table(done.report, done.result))
     if config.json:
+        if config.ladder:  # what an entry of the ladder has to say besides
+            done.report.update(commit=commit(), machine=machine())
         write_whole(Path(config.json), json.dumps(done.report, indent=2) + "\n")
     if config.trace:
         write_whole(Path(config.trace), done.trace_text())
@@ -68,10 +72,22 @@ def table(report: dict[str, Any], result: Evaluation) -> str:
     for steps in np.unique(result.optimal[result.optimal > 0]):
         rows = result.optimal == steps
         lines.append(f"{steps:<22}{rows.sum():>12}{100 * solved[rows].mean():>11.2f}%{result.episodes.transfers[rows].mean():>12.3f}")
+    lines += _ladder_lines(report) if "ladder" in report else []
     lines += _lines_by_arms(report) if "by_arms" in report else []
     lines += ["", outcomes, f"one decision: p50 {report['decision_us']['p50']:.0f} us, p99 {report['decision_us']['p99']:.0f} us"]
     lines += _outage_lines(report["outage"]) if "outage" in report else []
     return "\n".join(lines + (_loop_lines(report) if "success_in_the_end" in report else []))
+
+
+def _ladder_lines(report: dict[str, Any]) -> list[str]:
+    """What only a rung of the ladder has."""
+    low, high = report["regret_ci95"]
+    about = report["ladder"]
+    return [
+        "",
+        f"ladder {about['rung']}, {about['id']}: regret of a problem {report['regret']:.4f} [{low:.4f}, {high:.4f}], "
+        f"of a failed one {about['max_steps']} less its optimum",
+    ]
 
 
 def _lines_by_arms(report: dict[str, Any]) -> list[str]:

@@ -7,7 +7,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -56,8 +56,10 @@ from marl_handover.motion.path_length_table import known_table
 from marl_handover.policies import ResigningPolicy, ShieldedPolicy, SupervisorPolicy
 from marl_handover.progress import Bar
 from marl_handover.task.episode import Decision, Episodes, Observer
+from marl_handover.task.ladder import rung
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problem_file import PosedProblems, read_problems
+from marl_handover.task.problems import regret
 from marl_handover.task.rules import Outcome, Rules
 
 if TYPE_CHECKING:
@@ -95,11 +97,14 @@ class AssessmentConfig:
     calibration: str | None = path_field(None)  # of twin: folder of its calibration; null: runs/calibration/twin
     hardware: HardwareConfig | None = None  # of twin: single keys change its electronics; ports are always the emulated ones
     problems: str = path_field()  # JSON Lines of problems instead of random ones
+    ladder: str = ""  # a rung of the ladder: its cell, its task and the first `episodes` of its problems; pair, triangle, scattered8 ...
     outage: OutageConfig | None = None  # an arm that goes out of order in mid-episode; null: none does
 
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on what can be refused without playing."""
         check_bounds(self)
+        if self.ladder:
+            _check_ladder(self)
         backend_options(self)
         if self.layouts is not None:
             self.layouts.validate()
@@ -133,6 +138,7 @@ def assess(config: AssessmentConfig, traced: bool = False, progress: bool = Fals
         InvalidSetting, UnknownChoice, MissingFile, CorruptFile, CheckpointMismatch: on bad input.
     """
     config.validate()
+    config = _on_rung(config)
     policy = policies.adapted(config.policy, config.cell, config.seed, motion=config.motion, **vars(config.task))
     play = _play_loop if config.backend != "kinematic" else _play_kinematic if config.layouts is None else _play_layouts
     result, trace_text, rules, added = play(config, policy, traced, progress)
@@ -146,8 +152,49 @@ def assess(config: AssessmentConfig, traced: bool = False, progress: bool = Fals
         "seed": config.seed,
         **result.report(),
         **added,
+        **_regret(config, result, rules),
     }
     return Assessment(report, result, trace_text, rules)
+
+
+def _check_ladder(config: AssessmentConfig) -> None:
+    """Refuse what a rung says itself, and a backend that cannot have its noise."""
+    of = rung(config.ladder)
+    said = {f"task.{key}": value for key, value in vars(config.task).items() if key != "architecture"}
+    said |= {
+        "cell": config.cell and config.cell.name,
+        "layouts": config.layouts,
+        "problems": config.problems or None,
+        "outage": config.outage,
+    }
+    for key, value in said.items():
+        if value is not None:
+            raise InvalidSetting(key, value, f"left out with ladder={of.name}, which says it")
+    if of.is_noisy and config.backend not in ("kinematic", "noisy"):
+        raise InvalidSetting("backend", config.backend, f"kinematic or noisy for ladder={of.name}, whose arms have a noise of their own")
+
+
+def _on_rung(config: AssessmentConfig) -> AssessmentConfig:
+    """The settings with the cell and the task of the rung that is asked for, if one is."""
+    if not config.ladder:
+        return config
+    of = rung(config.ladder)
+    said = {key: value for key, value in vars(of.task()).items() if key in vars(config.task)} | {"architecture": config.task.architecture}
+    if config.backend != "kinematic" and not of.is_noisy:
+        said["noise"] = None  # the backend's own
+    return replace(config, cell=of.cell_config, task=TaskChanges(**said))
+
+
+def _regret(config: AssessmentConfig, result: Evaluation, rules: Rules) -> dict[str, Any]:
+    """On a rung: which one, the mean regret of a problem, and its 95 % interval over the problems."""
+    if not config.ladder:
+        return {}
+    of, ended = rung(config.ladder), result.episodes
+    optimum = of.fixed.optimum[: len(ended.outcome)]
+    each = np.asarray(regret(ended.outcome, ended.transfers, optimum, rules.config.max_steps), float)
+    mean, half = float(each.mean()), 1.959964 * float(each.std()) / math.sqrt(len(each))
+    about = {"rung": of.name, "id": of.id, "sha256": of.sha256, "max_steps": rules.config.max_steps}
+    return {"ladder": about, "regret": mean, "regret_ci95": [mean - half, mean + half]}
 
 
 Played = tuple[Evaluation, Callable[[], str], Rules, dict[str, Any]]
@@ -306,6 +353,9 @@ def _posed(config: AssessmentConfig, rules: Rules, fixed_for: str) -> list[Posed
     """Problems of a file, or random ones of the cell of ``rules``; ``fixed_for`` is what takes no other cell."""
     if config.problems:
         return read_problems(rules.cell, Path(config.problems), fixed_for)
+    if config.ladder:
+        start, goal, optimum = rung(config.ladder).fixed.take(slice(config.episodes))
+        return [PosedProblems(rules.cell, False, np.arange(len(optimum)), start, goal)]
     return [PosedProblems(rules.cell, False, np.arange(config.episodes), *random_problems(rules, config.episodes, config.seed))]
 
 

@@ -75,10 +75,9 @@ def pettingzoo_env(name: str, split: str = EVALUATION, **settings: Any) -> AECEn
         UnknownChoice, ChecksumMismatch, MissingFile: as :func:`gymnasium_env`.
     """
     of = rung(name)
-    task = of.task()
-    if task.noise.position_mm or task.noise.yaw_deg:
+    if of.is_noisy:
         settings = {"backend": "noisy", "backend_options": {"missed_grasps": 0.0}} | settings
-    return handover_aec.env(cell=_model(of.name), task=task, problems=RungSource(of, split), **settings)
+    return handover_aec.env(cell=_model(of.name), task=of.task(), problems=RungSource(of, split), **settings)
 
 
 @cache

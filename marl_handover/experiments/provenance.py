@@ -18,6 +18,7 @@ from marl_handover.files import package_path, read_bounded, write_whole
 from marl_handover.learning.settings import TrainConfig
 from marl_handover.parsing import LINES_BYTES, parse_json, read_json
 from marl_handover.policies.registry import content_hash
+from marl_handover.task.ladder import rung
 from marl_handover.task.rules import Outcome
 
 PLACES = ("out", "resume", "progress", "policy")
@@ -89,6 +90,8 @@ def contents_of(config: AssessmentConfig, own_run: bool) -> dict[str, str]:
     with suppress(HandoverError):
         if not own_run and (digest := content_hash(config.policy)):
             found["policy"] = digest
+        if config.ladder:
+            found["ladder"] = rung(config.ladder).sha256[:12]
         if config.problems:
             found["problems"] = hashlib.sha256(read_bounded(Path(config.problems), LINES_BYTES, "problems")).hexdigest()[:12]
     return found

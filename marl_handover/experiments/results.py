@@ -128,6 +128,8 @@ def _row(suite: Suite, row: RowSpec, tasks: Sequence[Task], runs: list[Tree]) ->
         "label": row.label or row.name,
         "arguments": None if row.train is None else list(tasks[0].arguments),
         "policy": row.policy,
+        "only": row.only,
+        "because": row.because,
         "settings": settings,
         "config_hash": None if settings is None else fingerprint(settings),
         "seeds": [run["seed"] for run in runs],

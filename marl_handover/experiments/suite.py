@@ -26,7 +26,7 @@ RUN = "{run}"
 """Stands for a trained row's run directory in the name of a policy."""
 
 CURVE_MEASURES = ("success_rate", "mean_steps", "steps_ratio", "training_success_rate", "training_mean_length")
-REPORTED = ("mean_steps",)
+REPORTED = ("mean_steps", "regret")
 """Measured besides, and not to be drawn as bars: mean steps mix in what failed, so that a policy that fails at once looks quick."""
 
 BAR_MEASURES = (
@@ -73,6 +73,7 @@ TABLES = {
     "paired": ("rows", "evaluations"),
     "arms": ("rows", "evaluations"),
     "outage": ("rows", "evaluations"),
+    "ladder": ("rows", "evaluations"),
 }
 """The same of tables."""
 
@@ -105,6 +106,8 @@ class RowSpec:
     policy: str = ""  # a policy by name, for a row that is not trained
     evaluate: list[str] = field(default_factory=list)  # arguments put after those of every evaluation
     seeds: int = bounded(0, 0, MAX_SEEDS)  # 0: the suite's
+    only: list[str] = field(default_factory=list)  # evaluations that it can take; empty: all
+    because: str = ""  # why not the others, which tables of the ladder tell
 
 
 @dataclass
@@ -137,7 +140,7 @@ class TableSpec:
     """One table, as Markdown and CSV."""
 
     name: str = ""
-    kind: str = ""  # evaluation, milestones, runs, comparison, range, arms, outage, paired: two evaluations of the same problems
+    kind: str = ""  # evaluation, milestones, runs, comparison, range, arms, outage, ladder, paired: two evaluations of the same problems
     title: str = ""
     rows: list[str] = field(default_factory=list)
     evaluations: list[str] = field(default_factory=list)  # as of figures
@@ -283,6 +286,8 @@ def _fitted(schema: type[Spec], tree: Any, path: Path, where: str, also: Iterabl
 
 def _applies(spec: EvaluationSpec, row: RowSpec) -> bool:
     """Whether the row is judged so: it is named, or all are, except that an untrained one has no run to name."""
+    if row.only and spec.name not in row.only:
+        return False
     return row.name in spec.rows if spec.rows else row.train is not None or RUN not in spec.policy
 
 
@@ -323,6 +328,8 @@ def check(suite: Suite) -> None:
         if table.kind == "comparison":
             _check_pairs(suite, table)
         _check_by_arms(suite, f"tables: {table.name}", table)
+        if table.kind == "ladder":
+            _check_on_rungs(suite, table)
         if table.kind == "paired" and len(table.evaluations) != 2:
             raise BadEntry(f"tables: {table.name}: evaluations", "two of them are held against each other: [one, other]")
     _check_shield(suite)
@@ -338,6 +345,11 @@ def _check_row(row: RowSpec) -> None:
 
 def _check_evaluations(suite: Suite) -> None:
     rows = tuple(row.name for row in suite.rows)
+    for row in suite.rows:
+        for name in row.only:
+            require_choice(f"rows: {row.name}: only", name, tuple(spec.name for spec in suite.evaluations))
+        if bool(row.only) != bool(row.because):
+            raise BadEntry(f"rows: {row.name}", "`only` some evaluations and `because` go together")
     for spec in suite.evaluations:
         if spec.name in RECORDS:
             raise BadEntry(f"evaluations: {spec.name}", f"a run's own records are called so; any name but {', '.join(RECORDS)}")
@@ -391,6 +403,13 @@ def _check_by_arms(suite: Suite, where: str, spec: FigureSpec | TableSpec) -> No
         raise BadEntry(f"{where}: evaluations", f"the kind arms names some in random cells: {', '.join(random) or 'there is none'}")
     for name in spec.evaluations:
         require_choice(f"{where}: evaluations", name, tuple(random))
+
+
+def _check_on_rungs(suite: Suite, table: TableSpec) -> None:
+    """A table of the ladder shows evaluations on its rungs alone."""
+    for spec in suite.evaluations:
+        if spec.name in (table.evaluations or [spec.name]) and not any(argument.startswith("ladder=") for argument in spec.arguments):
+            raise BadEntry(f"tables: {table.name}: evaluations", f"{spec.name} is not on a rung: it has no argument ladder=RUNG")
 
 
 def _check_shield(suite: Suite) -> None:

@@ -47,12 +47,13 @@ class Column(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A table by name."""
+    """A table by name; ``notes``, each a sentence, stand below it in Markdown."""
 
     name: str
     title: str
     columns: list[Column]
     rows: list[list[Cell]]
+    notes: Sequence[str] = ()
 
 
 def make_tables(results: Tree) -> list[Table]:
@@ -70,16 +71,21 @@ def make_tables(results: Tree) -> list[Table]:
         "paired": _paired,
         "arms": _arms,
         "outage": _outage,
+        "ladder": _ladder,
     }
-    tables = [Table(spec["name"], spec["title"] or spec["name"], *makers[spec["kind"]](results, spec)) for spec in results["tables"]]
+    tables = [
+        Table(spec["name"], spec["title"] or spec["name"], *makers[spec["kind"]](results, spec), _notes(results, spec))
+        for spec in results["tables"]
+    ]
     return [table for table in tables if table.rows]
 
 
 def markdown(table: Table) -> str:
-    """The table in Markdown, without its title."""
+    """The table in Markdown, without its title, and its notes."""
     lines = [[column.title for column in table.columns], ["---"] * len(table.columns)]
     lines += [[cell.text.replace("|", "\\|") for cell in row] for row in table.rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    notes = "".join(f"\n{note}\n" for note in table.notes)
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n" + notes
 
 
 def csv_text(table: Table) -> str:
@@ -207,6 +213,44 @@ def _runs(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
         sizes = (_text(len(done)), _plain(row["settings"]["steps"]), _plain(gradient_steps), _text(best), _plain(minutes, "{:.1f}"))
         rows.append([_text(row["label"]), Cell(f"`{arguments}`", (arguments,)), *sizes, _text(commits)])
     return [Column(title) for title in titles], rows
+
+
+def _ladder(results: Tree, spec: Tree) -> tuple[list[Column], list[list[Cell]]]:
+    """The regret of a problem on each rung, a line a rung and a column for all rows of one label; below it is told what has no place."""
+    shown = _wanted(results, spec["rows"])
+    labels = list(dict.fromkeys(row["label"] for row in shown))
+    columns = [Column("rung"), Column("optimum")]
+    columns += [Column(label, tuple(f"{label} {part}" for part in ("regret", "low", "high", "success"))) for label in labels]
+    lines = []
+    for name, title in ((each["name"], each["label"] or each["name"]) for each in results["evaluations"]):
+        able = {row["label"]: row for row in shown if name in (row["only"] or [name])}
+        reports = {label: [run["evaluations"][name] for run in row["runs"] if name in run["evaluations"]] for label, row in able.items()}
+        known = [report for each in reports.values() for report in each]
+        if known and name in (spec["evaluations"] or [name]):
+            cells = [_regret(reports.get(label)) for label in labels]
+            lines.append([_text(title), _plain(known[0]["optimal_mean_steps"], "{:.3f}"), *cells])
+    return columns, lines
+
+
+def _regret(reports: Sequence[Tree] | None) -> Cell:
+    """Mean regret, its interval over the problems or, of more runs than one, its ends over the runs, and the share of problems solved.
+
+    ``reports``: of the runs that there are; None for what has no place on the rung.
+    """
+    if not reports:
+        return Cell(NONE if reports is None else "not run", (None, None, None, None))
+    each = [report["regret"] for report in reports]
+    low, high = reports[0]["regret_ci95"] if len(each) == 1 else (min(each), max(each))
+    mean, success = statistics.fmean(each), statistics.fmean(report["success_rate"] for report in reports)
+    return Cell(f"{mean:.3f} [{low:.3f}, {high:.3f}], {100 * success:.1f} %", (mean, low, high, success))
+
+
+def _notes(results: Tree, spec: Tree) -> list[str]:
+    """Of a table of the ladder: why rows are not on every rung."""
+    if spec["kind"] != "ladder":
+        return []
+    reasons = {row["label"]: row["because"] for row in _wanted(results, spec["rows"]) if row["because"]}
+    return [f"{NONE} *{label}*: {reason}." for label, reason in reasons.items()]
 
 
 RANGED = (("success_rate", "success, %", "{:.2f}", 100.0, min), ("steps_ratio", "steps ÷ optimum (solved)", "{:.3f}", 1.0, max))

@@ -85,6 +85,11 @@ class Rung:
     sha256: str = ""  # of the file
 
     @property
+    def is_noisy(self) -> bool:
+        """Whether its arms place a little beside where they are to."""
+        return self.noise.position_mm > 0 or self.noise.yaw_deg > 0
+
+    @property
     def path(self) -> Path:
         """The file of problems: JSON Lines of ``state``, ``goal`` and ``optimum``, which ``problems=FILE`` takes as well."""
         return resource_path(FOLDER) / f"{self.name}.jsonl"

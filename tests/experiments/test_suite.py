@@ -41,8 +41,8 @@ def suite(tmp_path) -> Suite:
     return load_suite(written(tmp_path, MINIMAL))
 
 
-def test_seven_suites_are_shipped():
-    assert SHIPPED == ["ablations", "charts", "engines", "many_arms", "paper", "paper_steps", "seeds", "variants"]
+def test_nine_suites_are_shipped():
+    assert SHIPPED == ["ablations", "charts", "engines", "ladder", "many_arms", "paper", "paper_steps", "seeds", "variants"]
 
 
 @pytest.mark.parametrize("name", SHIPPED)
