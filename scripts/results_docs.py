@@ -13,7 +13,7 @@ from marl_handover.files import write_whole
 
 ROOT = Path(__file__).resolve().parents[1]
 EVIDENCE, PICTURES = ROOT / "bench" / "results" / "compare", "../bench/results/compare"
-PAGES = (ROOT / "docs" / "results.md", ROOT / "docs" / "engines.md")
+PAGES = tuple(ROOT / "docs" / name for name in ("results.md", "engines.md", "benchmark.md"))
 PARTIAL = "partial=true"
 
 if __name__ == "__main__":

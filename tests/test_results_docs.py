@@ -13,8 +13,8 @@ from marl_handover.experiments.suite import load_suite, suite_folder
 from marl_handover.experiments.tables import NOT_RUN, blocks, filled, make_tables, markdown, partial_line, read_evidence
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE, ENGINES = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("results.md", "engines.md"))
-BLOCKS = blocks(PAGE) + blocks(ENGINES)
+PAGE, ENGINES, LADDER = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("results.md", "engines.md", "benchmark.md"))
+BLOCKS = blocks(PAGE) + blocks(ENGINES) + blocks(LADDER)
 EVIDENCE = read_evidence(ROOT / "bench" / "results" / "compare")
 SINGLE = ROOT / "bench" / "results" / "2026-11-22"
 """Runs outside the suites."""
@@ -34,7 +34,11 @@ def test_the_pages_have_a_block_for_every_table_and_figure_of_every_suite():
 
 
 def test_every_mark_is_closed():
-    assert len(re.findall(r"<!-- (?:table|figure):", PAGE + ENGINES)) == len(re.findall(r"<!-- end -->", PAGE + ENGINES)) == len(BLOCKS)
+    assert (
+        len(re.findall(r"<!-- (?:table|figure):", PAGE + ENGINES + LADDER))
+        == len(re.findall(r"<!-- end -->", PAGE + ENGINES + LADDER))
+        == len(BLOCKS)
+    )
 
 
 def said_first(block) -> str:
@@ -77,7 +81,7 @@ def test_no_table_of_numbers_stands_outside_the_blocks():
 
 
 def test_filling_the_page_again_changes_nothing():
-    for page in (PAGE, ENGINES):
+    for page in (PAGE, ENGINES, LADDER):
         assert filled(page, EVIDENCE, "../bench/results/compare") == page
 
 

@@ -242,15 +242,20 @@ def _regret(reports: Sequence[Tree] | None) -> Cell:
     each = [report["regret"] for report in reports]
     low, high = reports[0]["regret_ci95"] if len(each) == 1 else (min(each), max(each))
     mean, success = statistics.fmean(each), statistics.fmean(report["success_rate"] for report in reports)
-    return Cell(f"{mean:.3f} [{low:.3f}, {high:.3f}], {100 * success:.1f} %", (mean, low, high, success))
+    told = [f"{round(value, 3) + 0.0:.3f}" for value in (mean, low, high)]  # no minus before a zero
+    return Cell(f"{told[0]} [{told[1]}, {told[2]}], {100 * success:.1f} %", (mean, low, high, success))
 
 
 def _notes(results: Tree, spec: Tree) -> list[str]:
-    """Of a table of the ladder: why rows are not on every rung."""
+    """Of a table of the ladder: why rows are not on every rung that it shows."""
     if spec["kind"] != "ladder":
         return []
-    reasons = {row["label"]: row["because"] for row in _wanted(results, spec["rows"]) if row["because"]}
-    return [f"{NONE} *{label}*: {reason}." for label, reason in reasons.items()]
+    shown = spec["evaluations"] or [each["name"] for each in results["evaluations"]]
+    reasons, taken = {}, set()
+    for row in _wanted(results, spec["rows"]):
+        reasons[row["label"]] = row["because"]
+        taken |= {(row["label"], name) for name in row["only"] or shown}
+    return [f"{NONE} *{label}*: {reason}." for label, reason in reasons.items() if any((label, name) not in taken for name in shown)]
 
 
 RANGED = (("success_rate", "success, %", "{:.2f}", 100.0, min), ("steps_ratio", "steps ÷ optimum (solved)", "{:.3f}", 1.0, max))
@@ -465,7 +470,8 @@ def partial_line(results: Mapping[str, Any]) -> str:
     """How many seeds of which rows partial results have: ``2 of 5 seeds so far: ...``."""
     groups: dict[str, list[str]] = {}
     for part in results["progress"]:
-        groups.setdefault(f"{part['done']} of {part['of']} seeds so far", []).append(f"*{part['label']}*")
+        labels = groups.setdefault(f"{part['done']} of {part['of']} seeds so far", [])
+        labels += [label] if (label := f"*{part['label']}*") not in labels else []
     if len(groups) == 1:
         return f"Partial: {next(iter(groups))}, of all rows."
     return "Partial: " + "; ".join(f"{count}: {', '.join(labels)}" for count, labels in groups.items()) + "."
