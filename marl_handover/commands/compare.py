@@ -105,15 +105,23 @@ def _require_done(results: dict[str, Any], tasks: int, others: Sequence[str], re
 
 
 def _calibrate_twin(tasks: Sequence[Task]) -> None:
-    """Calibrate the twin as it is shipped, if a task is to be judged on it and nobody has done so yet."""
+    """Calibrate every twin that a task is to be judged on, if nobody has done so yet."""
     from marl_handover.commands import calibrate
+    from marl_handover.config import CellConfig
     from marl_handover.control.settings import twin_workcell
     from marl_handover.control.workcell import is_calibrated
+    from marl_handover.hardware.settings import ARMS
 
-    configs = [job.config for task in tasks for job in task.jobs]
-    if any(config.backend == "twin" and config.calibration is None for config in configs) and not is_calibrated(twin_workcell().folder()):
-        print(f"calibrating the twin first, into {twin_workcell().folder()}", file=sys.stderr)
-        calibrate.run(calibrate.CalibrateCommand(**vars(twin_workcell())))
+    for config in (job.config for task in tasks for job in task.jobs):
+        if config.backend != "twin" or config.calibration is not None:
+            continue
+        workcell, cell = twin_workcell(config.hardware), config.cell or CellConfig()
+        arms = tuple(workcell.hardware.for_arms().arms)
+        if arms == ARMS:  # all twins of pairs share the calibration of the one that is shipped
+            workcell, cell = twin_workcell(), CellConfig()
+        if not is_calibrated(workcell.folder(), arms):
+            print(f"calibrating the twin first, into {workcell.folder()}", file=sys.stderr)
+            calibrate.run(calibrate.CalibrateCommand(**vars(workcell), cell=cell))
 
 
 def _run_tasks(config: CompareConfig, tasks: Sequence[Task]) -> tuple[dict[str, str], list[str]]:

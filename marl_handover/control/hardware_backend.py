@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +23,7 @@ from marl_handover.envs.backends import Execution
 from marl_handover.envs.cycle_check import CycleCheck, Refusal, welded
 from marl_handover.errors import WorkFailed
 from marl_handover.hardware.estop import PrivateStop, StopLatch
-from marl_handover.hardware.settings import HardwareConfig, twin_of
+from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.motion.pick_place import timed_phases
 from marl_handover.motion.trajectory import LOADED_PHASES, Phase, PickPlacePaths
 from marl_handover.perception.calibration import Pixels
@@ -296,9 +295,7 @@ class TwinBackend(HardwareBackend):
         hardware: HardwareConfig | None = None,
         engine: str | None = None,
     ) -> None:
-        config = twin_workcell()
+        config = twin_workcell(hardware)
         config.twin.engine = engine
-        if hardware is not None:
-            config.hardware = replace(hardware, name=twin_of(hardware.name))
         config.calibration = calibration or ""
         super().__init__(model, motion, config=config, latch=None if config.hardware.stop_file else PrivateStop())

@@ -11,7 +11,7 @@ from marl_handover.compose import from_yaml
 from marl_handover.config import ENGINES, bounded, check_bounds, chosen, path_field, require_between, seed_field
 from marl_handover.errors import InvalidSetting
 from marl_handover.files import resource_path
-from marl_handover.hardware.settings import HardwareConfig
+from marl_handover.hardware.settings import HardwareConfig, twin_of
 from marl_handover.perception.settings import (
     MARKERS,
     BoardConfig,
@@ -145,6 +145,8 @@ def _require_unused(name: str, given: Any, usual: Any, used: Sequence[str], by: 
             raise InvalidSetting(f"{name}.{part.name}", value, f"left out with {by}")
 
 
-def twin_workcell() -> WorkcellConfig:
-    """The twin as it is shipped."""
-    return WorkcellConfig(from_yaml(HardwareConfig, resource_path("configs/hardware/twin.yaml")))
+def twin_workcell(hardware: HardwareConfig | None = None) -> WorkcellConfig:
+    """The twin of ``hardware``, None: of the pair as it is shipped."""
+    if hardware is None:
+        return WorkcellConfig(from_yaml(HardwareConfig, resource_path("configs/hardware/twin.yaml")))
+    return WorkcellConfig(replace(hardware, name=twin_of(hardware.name)))

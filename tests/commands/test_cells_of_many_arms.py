@@ -8,9 +8,12 @@ import math
 import numpy as np
 import pytest
 
-from marl_handover.cell import build_cell, cell_config, layout_cell
+from marl_handover import policies
+from marl_handover.cell import build_cell, cell_config, layout_cell, load_cell
 from marl_handover.cli import main
 from marl_handover.commands.workspace import workspace_summary
+from marl_handover.envs import handover_aec
+from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.report.motion import read_motions
 from tests.layouts import BLOCKED, SHIPPED
 from tests.oracles.layouts import Layout
@@ -128,3 +131,43 @@ def test_evaluate_plays_shipped_cells_and_plot_reads_its_trace(tmp_path, name):
 def test_a_trained_policy_of_a_pair_takes_no_third_arm(command, capsys):
     assert main([command, "cell=triangle", "policy=shielded:pretrained_b"]) == 2
     assert "a trained policy is for two arms; this cell has 3: north, west, east" in capsys.readouterr().err
+
+
+MIXED = """
+name: mixed
+arms:
+  - {name: lynx, x_mm: 0.0, y_mm: 254.0, facing_deg: -90.0, robot: al5a}
+  - {name: standard, x_mm: -220.0, y_mm: -127.0, facing_deg: 30.0, robot: so101}
+  - {name: pincher, x_mm: 220.0, y_mm: -127.0, facing_deg: 150.0, robot: px100}
+"""
+
+
+@pytest.mark.parametrize(("backend", "policy"), [("noisy", "exact"), ("bullet", "exact"), ("mujoco", "pretrained_any")])
+def test_three_robots_of_three_makers_pass_a_block_on(tmp_path, backend, policy):
+    """Each by its own kinematics, shapes and hand, past the two others where these truly are."""
+    pytest.importorskip({"bullet": "pybullet", "mujoco": "mujoco"}.get(backend, "numpy"))
+    (tmp_path / "mixed.yaml").write_text(MIXED)
+    report, trace = tmp_path / "report.json", tmp_path / "trace.jsonl"
+    more = ["episodes=4", "seed=3", f"json={report}", f"trace={trace}", "progress=false"]
+    assert main(["evaluate", f"policy={policy}", f"cell={tmp_path / 'mixed.yaml'}", f"backend={backend}", *more]) == 0
+    result = json.loads(report.read_text())
+    assert result["success_in_the_end"] == 1.0
+    assert len({json.loads(line)["arm"] for line in trace.read_text().splitlines()}) >= 2
+
+
+@pytest.mark.parametrize(("cell", "backend"), [("triangle", "bullet"), ("line4", "mujoco"), ("ring6", "noisy")])
+def test_agents_of_many_arms_solve_an_episode_on_every_backend(cell, backend):
+    """The AEC environment's supervisor and executors, one an arm, without the loop."""
+    pytest.importorskip({"bullet": "pybullet", "mujoco": "mujoco"}.get(backend, "numpy"))
+    env = handover_aec.env(cell=cell, backend=backend)
+    supervisor, built = policies.load("exact", load_cell(cell)), build_cell(cell_config(cell))
+    arms = {agent: ExecutorAgent(agent, built) for agent in env.possible_agents[1:]}
+    env.reset(seed=2)
+    for agent in env.agent_iter(40):
+        observation, _, terminated, truncated, info = env.last()
+        if agent == "supervisor" and terminated:
+            assert info["outcome"] == "success"
+        acts = arms[agent].act if agent in arms else supervisor
+        env.step(None if terminated or truncated else acts(observation))
+    assert not env.agents, "the episode is over"
+    env.close()

@@ -7,12 +7,19 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from marl_handover.cell import cell_config
 from marl_handover.cli import main
+from marl_handover.commands import calibrate, compare
+from marl_handover.compose import from_yaml
+from marl_handover.control.evaluation import AssessmentConfig
 from marl_handover.experiments import runs
+from marl_handover.files import resource_path
+from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.locks import held
 
 SUITE = """
@@ -304,3 +311,19 @@ def test_the_papers_suite_in_its_smoke_size(tmp_path):
     assert found["missing"] == []
     for part, kinds in (("figures", ("png", "pdf")), ("tables", ("md", "csv"))):
         assert {path.name for path in (tmp_path / part).iterdir()} == {f"{item['name']}.{kind}" for item in found[part] for kind in kinds}
+
+
+def test_a_twin_of_more_arms_is_calibrated_in_its_own_folder_and_cell(tmp_path, monkeypatch):
+    """Once for all rows, and not again where somebody has done it; a pair's is that of the shipped twin."""
+    asked = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(calibrate, "run", lambda config: asked.append((str(config.folder()), config.cell.name)))
+    three = from_yaml(HardwareConfig, resource_path("configs/hardware/triangle.yaml"))
+    jobs = [
+        AssessmentConfig(backend="twin", cell=cell_config("triangle"), hardware=three),
+        AssessmentConfig(backend="twin"),
+        AssessmentConfig(backend="twin", calibration="elsewhere"),
+        AssessmentConfig(backend="kinematic"),
+    ]
+    compare._calibrate_twin([SimpleNamespace(jobs=[SimpleNamespace(config=job)]) for job in jobs])
+    assert asked == [("runs/calibration/triangle_twin", "triangle"), ("runs/calibration/twin", "paper")]
