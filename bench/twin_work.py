@@ -33,13 +33,13 @@ from marl_handover.control.events import FAULTS, Event
 from marl_handover.control.session import GivenGoal, Session
 from marl_handover.control.settings import WorkcellConfig, twin_workcell
 from marl_handover.control.transfers import Episode
-from marl_handover.control.twin import mount_over
+from marl_handover.control.twin import camera_over
 from marl_handover.control.workcell import is_calibrated
 from marl_handover.errors import WorkFailed
 from marl_handover.files import resource_path
 from marl_handover.hardware.settings import HardwareConfig
 from marl_handover.learning.evaluation import random_problems
-from marl_handover.perception.settings import USUAL_EYE_MM
+from marl_handover.perception.settings import USUAL_EYE_MM, CameraConfig
 from marl_handover.task.rules import Outcome, Rules
 
 HANG_WALL_S, HANG_VIRTUAL_S = 900.0, 600.0
@@ -68,7 +68,7 @@ def usual(values: dict[str, Any]) -> WorkcellConfig:
     """The twin of the bench's hardware as it is shipped, its camera over the middle of the bench's cell."""
     config = WorkcellConfig(from_yaml(HardwareConfig, resource_path(f"configs/hardware/{values['hardware']}.yaml")))
     config.mount = replace(config.mount, tilt_deg=[0.0, 0.0], turn_deg=0.0)
-    hung = mount_over(build_cell(cell_config(values["cell"])), config)
+    hung, (config.camera.width_px, config.camera.height_px) = camera_over(build_cell(cell_config(values["cell"])), config)
     x, y, z = (0.0, 0.0, 700.0) if hung.eye_mm is None else np.subtract(hung.eye_mm, USUAL_EYE_MM) + (0.0, 0.0, 700.0)
     config.mount = replace(hung, eye_mm=[float(x), float(y), float(z)])
     return config
@@ -85,7 +85,10 @@ def robot_changes(seed: int, robot: int, noise: float, config: WorkcellConfig | 
     changes["mount.eye_mm"] = (np.array(config.mount.eye_mm) + random.uniform(-4, 4, 3)).round(2).tolist()
     changes["mount.tilt_deg"] = random.uniform(-0.35, 0.35, 2).round(3).tolist()
     changes["mount.turn_deg"] = round(config.mount.turn_deg + float(random.uniform(-1, 1)), 3)
-    changes["mount.focal_px"] = round(float(random.uniform(912, 922)), 2)
+    finer = config.camera.width_px / CameraConfig.width_px
+    changes["mount.focal_px"] = round(float(random.uniform(912, 922)) * finer, 2)
+    if finer != 1.0:
+        changes |= {"camera.width_px": config.camera.width_px, "camera.height_px": config.camera.height_px}
     return changes | {name: round(noise * read(config, name), 6) for name in NOISES}
 
 

@@ -26,7 +26,7 @@ from marl_handover.perception.calibration import Pixels, hung_camera
 from marl_handover.perception.camera import Frame, RenderedCamera
 from marl_handover.perception.printables import Sheet, marker_sheet
 from marl_handover.perception.scene import CellPainter, held_boards
-from marl_handover.perception.settings import USUAL_EYE_MM, MountConfig
+from marl_handover.perception.settings import USUAL_EYE_MM, CameraConfig, MountConfig
 from marl_handover.simulation.arm import SERVO_S
 from marl_handover.simulation.follower import ServoFollower, ServoState
 from marl_handover.simulation.world import SimulatedCell
@@ -35,36 +35,51 @@ _BOOTED_S = 1.0
 _HAND_STEP_S, _HAND_S = 0.02, 1.0
 _LIFTED_MM, _LEANING_RAD = 3.0, math.radians(3.0)
 _EDGE_MM = 1e4
-_RIM_PX, _LEAST_MARKER_PX = 25, 18.0
-"""What is kept free around all that arms reach, since no camera hangs straight; edge of a marker that is found well."""
+_RIM_PX = 25
+"""What is kept free around all that arms reach, since no camera hangs straight."""
+
+_GOOD_MARKER_PX, _LEAST_MARKER_PX = 24.0, 16.0
+"""Edge of a marker whose turn is seen to a degree, and of one that is found at all."""
+
+_FINE_PX = (1920, 1080)
 
 
-def mount_over(model: CellModel, config: WorkcellConfig) -> MountConfig:
-    """How the camera of ``config`` hangs over a cell: as it says, else as over a pair, or so that it sees all that more arms reach.
+def camera_over(model: CellModel, config: WorkcellConfig) -> tuple[MountConfig, tuple[int, int]]:
+    """How the camera of ``config`` hangs over a cell, and width and height of its pictures: as it says, else as over a pair.
 
-    That is high enough, and turned by a right angle if the cell is longer along x.
+    Over more arms it sees all that these reach: it hangs high enough, is turned by a right angle if the cell is longer along x, and has
+    pictures of more pixels, of the same lens, where a block's marker would have few of them and nobody has said how many there are.
 
     Raises:
-        InvalidSetting: its pictures are too small for so large a table; a block's marker would not be found in them.
+        InvalidSetting: pictures are too small for so large a table; a marker would not be found in them.
     """
-    mount, camera = config.mount, config.camera
+    mount, size_px = config.mount, (config.camera.width_px, config.camera.height_px)
     if mount.eye_mm is not None or model.cell.num_arms <= 2:
-        return mount
-    reached: Bools = np.any(model.grid.masks, axis=0)
-    x_mm, y_mm = model.grid.x_mm[reached.any(axis=1)], model.grid.y_mm[reached.any(axis=0)]
-    sides, room_px = np.array([np.ptp(y_mm), np.ptp(x_mm)]), np.array([camera.width_px, camera.height_px]) - 2 * _RIM_PX
-    ways = {0.0: float(max(sides / room_px)), 90.0: float(max(sides[::-1] / room_px))}  # world x is up in the picture, or to its right
-    turned_deg = min(ways, key=lambda way: ways[way])
-    mm_per_px = ways[turned_deg]
-    marker_px = model.cell.config.block.marker_mm / mm_per_px
-    if marker_px < _LEAST_MARKER_PX:
-        larger = math.ceil(camera.height_px * _LEAST_MARKER_PX / marker_px)
+        return mount, size_px
+    marker_mm = model.cell.config.block.marker_mm
+    turned_deg, mm_per_px, middle_mm = _framed(model, size_px)
+    if marker_mm / mm_per_px < _GOOD_MARKER_PX and size_px == (CameraConfig.width_px, CameraConfig.height_px):
+        mount = replace(mount, focal_px=mount.focal_px * _FINE_PX[0] / size_px[0])
+        size_px = _FINE_PX
+        turned_deg, mm_per_px, middle_mm = _framed(model, size_px)
+    if marker_mm / mm_per_px < _LEAST_MARKER_PX:
+        larger = math.ceil(size_px[1] * _LEAST_MARKER_PX * mm_per_px / marker_mm)
         limit = f"at least {larger}, width_px as much larger, to see all of the cell"
-        raise InvalidSetting("camera.height_px", camera.height_px, limit)
+        raise InvalidSetting("camera.height_px", size_px[1], limit)
     x, y, z = USUAL_EYE_MM
     above = math.ceil((mount.focal_px * mm_per_px + model.cell.config.block.height_mm) / 10) * 10
-    eye = [float(x_mm.min() + x_mm.max()) / 2 + x, float(y_mm.min() + y_mm.max()) / 2 + y, above + z % 10]
-    return replace(mount, eye_mm=eye, turn_deg=mount.turn_deg + turned_deg)
+    eye = [float(middle_mm[0]) + x, float(middle_mm[1]) + y, above + z % 10]
+    return replace(mount, eye_mm=eye, turn_deg=mount.turn_deg + turned_deg), size_px
+
+
+def _framed(model: CellModel, size_px: tuple[int, int]) -> tuple[float, float, Floats]:
+    """By how much a camera is best turned, in degrees, to see all that arms reach; mm a pixel is then; and its middle (2,) in mm."""
+    reached: Bools = np.any(model.grid.masks, axis=0)
+    x_mm, y_mm = model.grid.x_mm[reached.any(axis=1)], model.grid.y_mm[reached.any(axis=0)]
+    sides, room_px = np.array([np.ptp(y_mm), np.ptp(x_mm)]), np.array(size_px) - 2 * _RIM_PX
+    ways = {0.0: float(max(sides / room_px)), 90.0: float(max(sides[::-1] / room_px))}  # world x is up in the picture, or to its right
+    turned_deg = min(ways, key=lambda way: ways[way])
+    return turned_deg, ways[turned_deg], np.array([x_mm.min() + x_mm.max(), y_mm.min() + y_mm.max()]) / 2
 
 
 class Twin:
@@ -91,7 +106,7 @@ class Twin:
         """The electronics' settings, of the cell's arms alone, their ports those of the emulated boards."""
         self.cell = SimulatedCell(model, motion, engine=config.twin.engine)
         self.follower = ServoFollower(self.cell, self._servos)
-        truth = hung_camera(mount_over(model, config), (config.camera.width_px, config.camera.height_px))
+        truth = hung_camera(*camera_over(model, config))
         self.painter = CellPainter(model, truth, config.target, config.look, config.twin.seed)
         self.camera = RenderedCamera(self._picture, config.camera.max_age_s, self.clock.now_s)
         self.goal: Floats | None = None

@@ -15,7 +15,7 @@ from marl_handover.compose import from_yaml
 from marl_handover.config import MotionConfig
 from marl_handover.control.calibration import TerminalOperator, partners, places
 from marl_handover.control.settings import CardConfig, WorkcellConfig, twin_workcell
-from marl_handover.control.twin import Twin, mount_over
+from marl_handover.control.twin import Twin, camera_over
 from marl_handover.control.workcell import CAMERA_FILE
 from marl_handover.errors import InvalidSetting, WorkFailed
 from marl_handover.files import resource_path
@@ -80,31 +80,36 @@ def test_the_camera_sees_all_that_three_arms_reach(triangle, twin):
 
 
 def test_over_a_pair_and_where_it_is_told_the_camera_hangs_as_ever(model, triangle, config):
-    assert mount_over(model, config) is config.mount
+    assert camera_over(model, config) == (config.mount, (1280, 720))
     told = WorkcellConfig(config.hardware)
     told.mount.eye_mm = [0.0, 0.0, 900.0]
-    assert mount_over(triangle, told) is told.mount
+    assert camera_over(triangle, told) == (told.mount, (1280, 720))
+    assert camera_over(triangle, config)[1] == (1280, 720)
 
 
-def test_a_row_of_arms_lies_along_the_picture():
-    row, config = build_cell(cell_config("line4")), twin_workcell()
-    mount = mount_over(row, config)
-    assert mount.turn_deg == pytest.approx(90.4)
-    calibration = hung_camera(mount, (config.camera.width_px, config.camera.height_px))
-    for base in row.cell.bases:
-        assert (calibration.project(np.array([[base.x_mm, base.y_mm, 0.0]])) > 0).all()
-    left, right = calibration.project(np.array([[-700.0, 0.0, 0.0], [700.0, 0.0, 0.0]]))
-    assert abs(left[0] - right[0]) > 900.0
+@pytest.mark.parametrize("name", ["line4", "ring6"])
+def test_large_cells_are_seen_whole_by_a_camera_of_more_pixels(name):
+    """They lie along the picture; the lens is the same."""
+    cell, config = build_cell(cell_config(name)), twin_workcell()
+    mount, size_px = camera_over(cell, config)
+    assert mount.turn_deg == pytest.approx(90.4), "world x is longer than world y"
+    assert size_px == (1920, 1080)
+    assert mount.focal_px / 1920 == pytest.approx(config.mount.focal_px / 1280)
+    rows = np.argwhere(np.any(cell.grid.masks, axis=0))
+    places = np.column_stack([cell.grid.x_mm[rows[:, 0]], cell.grid.y_mm[rows[:, 1]], np.full(len(rows), 15.0)])
+    pixels = hung_camera(mount, size_px).project(places)
+    assert (pixels > 0).all()
+    assert (pixels < size_px).all()
 
 
 def test_a_cell_too_large_for_the_picture_names_one_that_would_do(triangle, config):
     small = WorkcellConfig(config.hardware)
     small.camera.width_px, small.camera.height_px = 640, 360
     with pytest.raises(InvalidSetting, match=r"camera.height_px = 360: must be at least (\d+)") as refused:
-        mount_over(triangle, small)
+        camera_over(triangle, small)
     small.camera.height_px = int(refused.value.limit.split()[2].rstrip(","))
     small.camera.width_px = math.ceil(small.camera.height_px * 16 / 9)
-    assert mount_over(triangle, small).eye_mm[2] > 702.0
+    assert camera_over(triangle, small)[0].eye_mm[2] > 702.0
 
 
 def test_three_arms_pass_a_block_on_through_bytes_and_pixels(known, tmp_path):
