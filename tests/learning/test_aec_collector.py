@@ -295,7 +295,7 @@ def worker(monkeypatch):
     """A process that lives until it is killed."""
     monkeypatch.setattr(aec_collector, "LOOK_S", 0.05)
     monkeypatch.setattr(aec_collector, "GRACE_S", 0.2)
-    process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(600,), daemon=True)
+    process = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,), daemon=True)
     process.start()
     yield process
     process.kill()
