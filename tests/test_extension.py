@@ -184,6 +184,7 @@ def test_an_algorithm(write, tmp_path, capsys):
     assert "algorithm.boldness = 0.0: must be between 1 and 10" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_worker_processes_know_them_too(write):
     with plugins.added([write("bolder.py", ALGORITHM)]):
         config = ALGORITHMS["bolder"](boldness=4.0)

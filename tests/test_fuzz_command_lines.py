@@ -13,10 +13,11 @@ from tests.fuzz_command_lines import Generator, hostile_files
 ROOT = Path(__file__).parents[1]
 
 
-def test_five_hundred_random_command_lines():
+@pytest.mark.parametrize("lines", ["100", pytest.param("500", marks=pytest.mark.slow)])
+def test_random_command_lines(lines):
     """In a process of their own, whose memory is theirs alone; another seed than ``make fuzz`` has."""
     script = ROOT / "tests" / "fuzz_command_lines.py"
-    done = subprocess.run([sys.executable, str(script), "500", "1"], capture_output=True, text=True, cwd=ROOT, check=False)
+    done = subprocess.run([sys.executable, str(script), lines, "1"], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-1000:]
     assert "0 wrong" in done.stdout.splitlines()[-1]
 

@@ -80,6 +80,7 @@ for line in {list(WITHOUT_ENGINES)!r}:
 """
 
 
+@pytest.mark.slow
 def test_what_needs_an_engine_that_is_not_installed_gives_one_line_that_installs_it_and_the_rest_works(tmp_path):
     """In a process in which the engines' packages cannot be imported."""
     done = subprocess.run([sys.executable, "-c", RUN_THEM], capture_output=True, text=True, cwd=tmp_path, timeout=280)

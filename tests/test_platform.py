@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 from marl_handover import cli
 
 UNIX_ONLY = ("fcntl", "termios", "tty", "pty")
@@ -24,6 +26,7 @@ print("STATUS", "emulate", cli.main(["emulate", "link=" + sys.argv[1]]))
 """
 
 
+@pytest.mark.slow
 def test_commands_need_none_of_them_unless_they_open_a_terminal(tmp_path):
     done = subprocess.run([sys.executable, "-c", CODE, str(tmp_path / "port")], capture_output=True, text=True, timeout=300)
     statuses = [tuple(line.split()[1:]) for line in done.stdout.splitlines() if line.startswith("STATUS")]

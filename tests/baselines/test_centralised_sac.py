@@ -129,6 +129,7 @@ def test_a_motion_that_is_surely_refused_is_worth_the_failure(trainer):
     assert (values[0] > values[1]).float().mean() > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["sac", "flat_sac"])
 def test_one_seed_one_run(small, table, tmp_path, algorithm):
     runs = []
@@ -177,6 +178,7 @@ def test_a_run_is_evaluated_with_its_motions(trained):
     assert again.report["success_rate"] >= done.report["success_rate"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["noisy", "physics"])
 def test_executors_do_not_make_its_motions(trained, backend):
     backend = default_engine() if backend == "physics" else backend

@@ -47,6 +47,7 @@ def test_the_page_says_what_was_stored():
     assert f"{growth.BEGIN}\n{growth.page_text(STORED)}\n{growth.END}" in page
 
 
+@pytest.mark.slow
 def test_both_costs_can_be_measured():
     (posed,) = problems_in_cells(LayoutConfig(arms=[2, 2]), 2, TaskConfig(), 8, 0).values()
     assert growth.decision_ms(policies.load("pretrained_any"), posed, 3) > 0

@@ -80,6 +80,7 @@ def test_a_refusal_is_timed_too_and_an_error_is_not_hidden():
         motion_peers.timed(lambda: 1 // 0)
 
 
+@pytest.mark.slow
 def test_the_report_is_written_with_its_settings_and_printed(planner, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(motion, "ROOT", tmp_path)
     motion.main(["rows=3", "every=2", "cycles=2", "costs=5", "starts=false", "many=2", "results=here"])

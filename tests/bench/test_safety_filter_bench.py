@@ -17,6 +17,7 @@ def court():
     return bench.Court(3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("holding", [(False, False), (True, False), (True, True)])
 def test_two_geometries_agree(court, holding):
     """Written apart from each other; the judge works out nothing beyond 12 mm."""

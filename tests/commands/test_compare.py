@@ -128,6 +128,7 @@ def test_a_second_call_runs_nothing(home, capsys):
     assert {path: path.stat().st_mtime_ns for path in (home / "out").rglob("done.json")} == before
 
 
+@pytest.mark.slow
 def test_an_interrupted_suite_does_what_is_left(home):
     lost = home / "out/exact/seed1"
     kept = {path: path.stat().st_mtime_ns for path in (home / "out").rglob("done.json") if lost not in path.parents}
@@ -140,6 +141,7 @@ def test_an_interrupted_suite_does_what_is_left(home):
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
 
 
+@pytest.mark.slow
 def test_a_changed_row_is_refused_and_made_anew_on_request(home, tmp_path, capsys):
     text = SUITE.replace("{name: kinematic, arguments: [episodes=40]}", "{name: kinematic, arguments: [episodes=50]}")
     (tmp_path / "small.yaml").write_text(text)
@@ -254,6 +256,7 @@ def test_a_part_of_a_suite_says_so_and_leaves_no_pictures_of_another_time(tmp_pa
     assert {path.stem for path in (tmp_path / "out/tables").iterdir()} == {"success"}
 
 
+@pytest.mark.slow
 def test_a_run_that_cannot_be_read_is_told_and_the_others_are_reported(home, capsys):
     metrics = home / "out/b/seed0/run/metrics.csv"
     kept = metrics.read_bytes()
@@ -283,6 +286,7 @@ def test_two_calls_at_one_folder_do_each_run_once(tmp_path):
     assert compared(tmp_path, "rows=[b]", "seeds=1") == 0
 
 
+@pytest.mark.slow
 def test_out_may_be_relative_and_what_is_not_done_is_no_success(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(runs, "GRACE_S", 0.0)

@@ -114,6 +114,7 @@ def test_other_settings_need_another_study(finished, capsys):
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_killed_search_continues(tmp_path):
     folder = tmp_path / "study"
     wanted = arguments(folder, "trials=2")

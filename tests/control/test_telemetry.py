@@ -124,6 +124,7 @@ def test_killed_viewers_a_lost_folder_and_forged_commands_change_nothing(cell, t
     assert final.state["totals"]["episodes"] == 1
 
 
+@pytest.mark.slow
 def test_a_session_that_may_be_steered_waits_obeys_fresh_commands_only_and_stops(cell):
     session = cell.run("episodes=50", "view_control=true", "paused=true")
     state = until(doing(cell, "paused"), session)
@@ -186,6 +187,7 @@ def test_a_stop_ends_a_pause_before_anything_was_sent(cell, empty_session_regist
     assert [row["event"] for row in rows(cell.log)] == ["session", "episode", "paused", "stopped"]
 
 
+@pytest.mark.slow
 def test_how_a_session_broke_off_is_told_and_its_folder_is_its_own(cell, tmp_path):
     session = cell.start(sys.executable, "-c", SLEEPER, str(cell.folder))
     until(lambda: cell.feed.read().live, session)

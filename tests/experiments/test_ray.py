@@ -107,6 +107,7 @@ def assert_nothing_is_lost(folder, results, victim):
     assert again == {victim.item: 1}
 
 
+@pytest.mark.slow
 def test_a_worker_process_dies_in_mid_run(cluster, two_nodes, tmp_path):
     results, victim = run_and_kill(cluster, tmp_path, lambda victim: os.kill(victim.pid, signal.SIGKILL))
     assert_nothing_is_lost(tmp_path, results, victim)
@@ -129,6 +130,7 @@ def test_a_failing_item_is_reported_and_the_others_go_on(cluster, two_nodes):
     assert "2 times" in results[2].error
 
 
+@pytest.mark.slow
 def test_a_node_dies_in_mid_run(cluster, two_nodes, tmp_path, caplog):
     def kill(victim):
         (node,) = [node for node in two_nodes if node.node_id == victim.node]

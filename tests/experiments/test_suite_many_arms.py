@@ -80,6 +80,7 @@ def test_the_table_of_outages_tells_of_those_that_stayed_solvable(results):
     assert content["rows"][0]["outages"]["outage"]["solved_share"]["value"] == 1.0
 
 
+@pytest.mark.slow
 def test_the_same_seeds_make_the_same_table(results, tmp_path):
     def timeless(table):
         return [[cell.text for cell in cells[:-1]] for cells in table.rows]

@@ -190,6 +190,7 @@ def test_workers_explore_as_far_as_training_is(small):
     assert worker._learner.random_share == pytest.approx(0.1)
 
 
+@pytest.mark.slow
 def test_a_run_learns_from_it_stops_and_goes_on(small, tmp_path, table):
     config = small(
         "sac", "source=aec", "steps=320", "evaluation_interval=160", "checkpoint_interval=160", "algorithm.env_steps_per_gradient_step=32"

@@ -240,6 +240,7 @@ def test_a_run_killed_five_times_ends_as_an_uninterrupted_one(table, tmp_path):
     assert all(torch.equal(value, other[key]) for key, value in one.items())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.getuid() != 0 or not shutil.which("unshare"), reason="only root takes shared memory away")
 def test_a_machine_without_shared_memory_is_told(tmp_path):
     code = "from marl_handover.learning.trainer import NoSharedMemory, require_shared_memory as r\n"

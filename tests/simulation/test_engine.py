@@ -59,6 +59,7 @@ def test_an_environment_that_nobody_holds_lets_its_world_go(engine):
     assert not there()
 
 
+@pytest.mark.slow
 def test_fifty_environments_leave_no_memory_behind(engine):
     """In a process of its own: what other tests keep is not counted.
 
@@ -140,6 +141,7 @@ def test_engines_are_named(model, motion, monkeypatch):
     assert default_engine() == "mujoco"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "package", "other"), [("bullet", "pybullet", "mujoco"), ("mujoco", "mujoco", "pybullet")])
 def test_an_engine_that_is_not_installed_is_named_with_the_line_that_installs_it(name, package, other):
     """And the other one is not needed to say so."""
@@ -151,6 +153,7 @@ def test_an_engine_that_is_not_installed_is_named_with_the_line_that_installs_it
     assert f"physics engine {name} needs the package {package}; run: pip install" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("engine", "other"), [("bullet", "mujoco"), ("mujoco", "pybullet")])
 def test_one_engine_does_without_the_other(engine, other):
     package = {"bullet": "pybullet"}.get(engine, engine)
