@@ -17,7 +17,7 @@ from __future__ import annotations
 import enum
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,21 @@ def compose(
 def to_yaml(config: Any) -> str:
     """Every value of the dataclass instance ``config`` as YAML, defaults included; :func:`from_yaml` reads it back."""
     return OmegaConf.to_yaml(OmegaConf.create(_plain(asdict(config))))
+
+
+def changed_yaml(config: Any) -> str:
+    """As :func:`to_yaml`, without what is as the dataclasses say by default, for people to read. Entries of lists lack empty texts only."""
+    return OmegaConf.to_yaml(OmegaConf.create(_plain(_changed(config))))
+
+
+def _changed(config: Any, entry_of_list: bool = False) -> Any:
+    if isinstance(config, list):
+        return [_changed(entry, entry_of_list=True) for entry in config]
+    if not is_dataclass(config) or isinstance(config, type):
+        return config
+    usual = type(config)()
+    values = {entry.name: (getattr(config, entry.name), getattr(usual, entry.name)) for entry in fields(config)}
+    return {name: _changed(value) for name, (value, default) in values.items() if (value != "" if entry_of_list else value != default)}
 
 
 def from_yaml(schema: type, path: Path | str, groups: Groups | None = None) -> Any:

@@ -75,6 +75,36 @@ class CellModel(NamedTuple):
             tuple(self.robots[arm] for arm in left),
         )
 
+    def without_obstacles(self) -> CellModel:
+        """The model as motions take it: they do not go around obstacles."""
+        config = replace(self.cell.config, obstacles=[])
+        return self._replace(cell=replace(self.cell, config=config)) if self.cell.keep_out else self
+
+    def relaid(self, config: CellConfig) -> CellModel:
+        """The model of ``config``, for those who move its arms by hand: robots that are here are taken over with their sectors, unread.
+
+        That takes a millisecond. Arms that are out of order stand in it, and arms may be unable to pass to each other; its grid is empty.
+
+        Raises:
+            InvalidSetting, MissingFile, UrdfError: a setting cannot be, as of a base that stands inside another one.
+        """
+        config.validate()
+        names, robots = _named(config)
+        here = {arm.robot: index for index, arm in reversed(list(enumerate(self.cell.arms)))}
+        kinds = {robot: _Kind(self.robots[here[robot]], self.arms[here[robot]]) for robot in set(robots) & set(here)}
+        fits = {robot: self.fits[here[robot]] for robot in kinds}
+        for robot in dict.fromkeys(robots):
+            if robot not in kinds:
+                settings = robot_of(config, robot)
+                kinds[robot] = _Kind(settings, read_robot(settings))
+                fits |= _fit_alone(config, robot, kinds[robot])
+        bases, arms = _bases(config), tuple(kinds[robot].model for robot in robots)
+        _require_apart(names, bases, arms)
+        cell = Cell(_arms(names, bases, robots, fits, kinds), replace(config, enabled=list(names)))
+        each = tuple(kinds[robot].settings for robot in robots)
+        grid = ManipulationGrid(np.empty(0), np.empty(0), np.empty((len(arms), 0, 0), bool), bases, cell.pick_heights_mm)
+        return CellModel(cell, arms, grid, tuple(fits[robot] for robot in robots), each)
+
 
 def build_cell(config: CellConfig) -> CellModel:
     """Compute the cell of ``config``, with the arms that are in order.
@@ -128,6 +158,12 @@ def _fits(config: CellConfig, grid: ManipulationGrid, robots: Sequence[str], kin
     return fits
 
 
+def _fit_alone(config: CellConfig, robot: str, kind: _Kind) -> dict[str, AnnulusFit]:
+    """The sector of a robot, which hardly depends on where its arms stand."""
+    alone = manipulation_grid([kind.model], config, [SE2(0.0, 0.0, (0.0, 1.0))], [kind.settings.pick_height_mm])
+    return _fits(config, alone, [robot], {robot: kind})
+
+
 def _arms(
     names: Sequence[str],
     bases: Sequence[SE2],
@@ -151,9 +187,8 @@ def _automatic_distance_mm(config: CellConfig, names: Sequence[str], robots: Seq
     Raises :class:`NoSharedSpace` if none does.
     """
     fits: dict[str, AnnulusFit] = {}
-    for robot, kind in kinds.items():  # the ring does not depend on where the arm stands
-        alone = manipulation_grid([kind.model], config, [SE2(0.0, 0.0, (0.0, 1.0))], [kind.settings.pick_height_mm])
-        fits |= _fits(config, alone, [robot], {robot: kind})
+    for robot, kind in kinds.items():
+        fits |= _fit_alone(config, robot, kind)
     one, other = (fits[robot] for robot in robots)
     least, most = one.r_min_mm + other.r_min_mm, one.r_max_mm + other.r_max_mm
     nominal = max(SPREAD * most, least + 0.25 * (most - least))

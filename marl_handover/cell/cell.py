@@ -262,6 +262,8 @@ class Cell(Sectors):
 
     def with_inset(self, chart_inset: float) -> Cell:
         """The same cell with another part of the chart in use."""
+        if chart_inset == self.config.chart_inset:
+            return self
         return replace(self, config=replace(self.config, chart_inset=chart_inset))
 
     def is_clear(self, position_mm: Array) -> Array:

@@ -31,7 +31,10 @@ if TYPE_CHECKING:
     from marl_handover.policies import SupervisorPolicy
 
 MODES = ("play", "trace", "live")
-SHIPPED = ("exact", "pretrained_b", "pretrained_a")
+ANYWHERE = ("exact", "pretrained_any", "greedy", "random")
+"""Policies of any cell."""
+
+SHIPPED = ("exact", "pretrained_b", "pretrained_a", "pretrained_any")
 LIVE_HZ = 30.0
 UNUSED: dict[str, tuple[str, ...]] = {"play": (), "trace": ("policy", "seed"), "live": ("policy", "seed", "speed", "task", "motion")}
 """Keys that mean nothing in a mode."""
@@ -105,7 +108,7 @@ def serve(config: ViewCommand, ended: threading.Event, ready: Callable[[str], No
     _check(config, mode)
     from marl_handover.viewer.server import address, keep_updating, open_server
 
-    with open_server(config.port, "two arms, one block") as server, _PAGES[mode](config, server) as page:
+    with open_server(config.port, "arms that hand over a block") as server, _PAGES[mode](config, server) as page:
         print(f"open {address(server)} in a browser on this machine; Ctrl-C ends", flush=True)
         if ready is not None:
             ready(address(server))
@@ -147,7 +150,7 @@ def _changed(group: str, values: Mapping[str, Any], usual: Mapping[str, Any]) ->
 @contextlib.contextmanager
 def _play(config: ViewCommand, server: Server) -> Iterator[Page]:
     from marl_handover import policies
-    from marl_handover.cell import build_cell
+    from marl_handover.cell import build_whole_cell
     from marl_handover.control.interactive.cell import InteractiveCell
     from marl_handover.viewer.play import RATE_HZ, SPEEDS, PlayPage
 
@@ -157,25 +160,27 @@ def _play(config: ViewCommand, server: Server) -> Iterator[Page]:
         return policies.adapted(name, config.cell, config.seed, motion=config.motion, **vars(config.task))
 
     policy = load(config.policy)
-    model = build_cell(policy.rules.cell.config)
+    model = build_whole_cell(policy.rules.cell.config)
     cell = InteractiveCell(policy, model, config.motion, config.seed)
-    names = tuple(dict.fromkeys((config.policy, *SHIPPED)))
+    shipped = SHIPPED if model.cell.num_arms == 2 else ANYWHERE
+    names = tuple(dict.fromkeys((config.policy, *shipped)))
     page = PlayPage(server, cell, policy, load, names, config.speed)
     yield Page(page.update, RATE_HZ, page.dragged)
 
 
 @contextlib.contextmanager
 def _trace(config: ViewCommand, server: Server) -> Iterator[Page]:
-    from marl_handover.cell import build_cell
+    from marl_handover.cell import build_whole_cell
     from marl_handover.viewer.play import RATE_HZ
     from marl_handover.viewer.trace import SPEEDS, TracePage
-    from marl_handover.viewer.trace_file import read_trace
+    from marl_handover.viewer.trace_file import read_trace, recorded_cell
 
     require_between("speed", config.speed, *SPEEDS)
-    trace = read_trace(Path(config.trace))
+    model = build_whole_cell(_cell(config, recorded_cell(Path(config.trace))))
+    trace = read_trace(Path(config.trace), model.cell.labels)
     changes: dict[str, Any] = {key: value for key, value in vars(config.task).items() if value is not None}
     changes["symmetry_order"] = trace.symmetry(config.task.symmetry_order)
-    page = TracePage(server, build_cell(_cell(config, trace.cell)), trace, replace(TaskConfig(), **changes), config.motion, config.speed)
+    page = TracePage(server, model, trace, replace(TaskConfig(), **changes), config.motion, config.speed)
     with contextlib.closing(page):
         yield Page(page.update, RATE_HZ)
 

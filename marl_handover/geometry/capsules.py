@@ -287,6 +287,7 @@ def joints_before(description: ArmDescription) -> dict[str, int]:
     return bodies
 
 
+@lru_cache(maxsize=64)
 def base_radius_mm(description: ArmDescription) -> float:
     """Radius in mm of a disc around the base frame's origin that the root link's shapes stay over."""
     root = next(link for link in description.links if link.name == description.root)

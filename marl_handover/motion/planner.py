@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from copy import copy
 from dataclasses import replace
 from functools import lru_cache
 
@@ -61,6 +62,17 @@ class MotionPlanner:
         self.collision_models = collision_models(model, self.motion)
         self.clearance_mm = np.array([self.motion.self_clearance_mm, self.motion.ground_clearance_mm])
         self._standing: tuple[tuple[int, bytes], Floats] = ((-1, b""), np.zeros((0, 9)))  # the last one asked for
+
+    def relaid(self, model: CellModel) -> MotionPlanner:
+        """The planner of a cell whose arms stand elsewhere. Robots that are here keep shapes and parked pose. Raises as the class."""
+        here = {id(arm): index for index, arm in reversed(list(enumerate(self.model.arms)))}
+        if model.cell.keep_out or not all(id(arm) in here for arm in model.arms):
+            return MotionPlanner(model, self.motion)
+        other, known = copy(self), [here[id(arm)] for arm in model.arms]
+        other.model, other.homes_rad = model, self.homes_rad[known]
+        other.collision_models = tuple(self.collision_models[index] for index in known)
+        other._standing = ((-1, b""), np.zeros((0, 9)))
+        return other
 
     @property
     def home_rad(self) -> Floats:

@@ -5,136 +5,19 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import ArrayLike
 
-from marl_handover.arrays import Floats
-from marl_handover.cell import Cell
 from marl_handover.config import require_choice
 from marl_handover.control.interactive.cell import InteractiveCell, Snapshot
 from marl_handover.errors import HandoverError
 from marl_handover.policies import SupervisorPolicy
+from marl_handover.viewer.handles import PlaneHandle, within_reach
+from marl_handover.viewer.layout_panel import LayoutPanel
 from marl_handover.viewer.scene import CellScene
-from marl_handover.viewer.words import at_once, by_hand, decision_words, flat, number, plain, score_words, state_words, write, yaw_of
-
-SIZE_M = 0.06
-_LEAST_SLOPE = 1e-3
-"""A line of sight flatter than this has no point on the table that anybody could mean."""
-
-
-class Dragged(NamedTuple):
-    """Where a handle was dragged: ``pose`` (3,) in mm and rad, anywhere in the plane; ``released``: that is where it was let go."""
-
-    pose: Floats
-    released: bool
-
-
-class PlaneHandle:
-    """Two arrows, a plate and an arc about the vertical; bodies that are named can be dragged too, without turning.
-
-    What was dragged waits to be fetched, the newest only: whoever moves things asks when he has time, and never gets old wishes.
-
-    Args:
-        server: of the page.
-        name: in the scene.
-        height_mm: of the handle above the table.
-        bodies: names of scene nodes to be dragged.
-        dragged: is set whenever there is something to fetch.
-    """
-
-    def __init__(
-        self, server: viser.ViserServer, name: str, height_mm: float, bodies: Sequence[str] = (), dragged: threading.Event | None = None
-    ) -> None:
-        self._height_mm, self._lock, self._dragged = height_mm, threading.Lock(), dragged or threading.Event()
-        self._newest: Dragged | None = None
-        self._held: Floats | None = None
-        self._grabbed_m = np.zeros(2)
-        self._control = server.scene.add_transform_controls(
-            name, scale=SIZE_M, active_axes=(True, True, False), line_width=3.0, depth_test=False, visible=False
-        )
-        self._control.on_update(self._on_control)
-        for body in bodies:
-            node: Any = server.scene.get_handle_by_name(body)
-            node.on_drag("left")(self._on_body)
-
-    @property
-    def held(self) -> Floats | None:
-        """The pose (3,) at which somebody holds it now; None: nobody does."""
-        with self._lock:
-            return self._held
-
-    def fetch(self) -> Dragged | None:
-        """The newest that nobody has fetched yet."""
-        with self._lock:
-            newest, self._newest = self._newest, None
-            return newest
-
-    def show(self, pose: ArrayLike | None) -> None:
-        """Put the handle at a pose (3,), unless somebody holds it; None hides it."""
-        if self.held is not None:
-            return
-        if pose is not None:
-            self._control.wxyz, self._control.position = flat(pose, self._height_mm)
-        self._control.visible = pose is not None
-
-    async def _on_control(self, event: viser.TransformControlsEvent) -> None:
-        position, wxyz = event.target.position, event.target.wxyz
-        self._note(np.array([1e3 * position[0], 1e3 * position[1], yaw_of(wxyz)]), event.phase)
-
-    async def _on_body(self, event: viser.SceneNodeDragEvent[Any]) -> None:
-        grip_m, here = np.asarray(event.start_position), self._control.position
-        if event.phase == "start":
-            self._grabbed_m = grip_m[:2] - here[:2]
-        point = on_level(np.asarray(event.client.camera.position), np.asarray(event.end_position), float(grip_m[2]))
-        where_m = here[:2] if point is None else point[:2] - self._grabbed_m
-        pose = np.array([*(1e3 * where_m), yaw_of(self._control.wxyz)])
-        self._control.position = flat(pose, self._height_mm)[1]
-        self._note(pose, event.phase)
-
-    def _note(self, pose: Floats, phase: str) -> None:
-        with self._lock:
-            sound = bool(np.isfinite(pose).all())
-            if phase == "end":
-                self._held = None
-            elif sound:
-                self._held = pose
-            if phase != "start" and sound:
-                self._newest = Dragged(pose, phase == "end")
-                self._dragged.set()
-
-
-def on_level(eye_m: Floats, seen_m: Floats, height_m: float) -> Floats | None:
-    """Where the line of sight from ``eye_m`` (3,) through ``seen_m`` (3,) meets a level height; None: nowhere in front of the eye."""
-    along = seen_m - eye_m
-    if abs(along[2]) < _LEAST_SLOPE * float(np.linalg.norm(along)):
-        return None
-    share = (height_m - eye_m[2]) / along[2]
-    return np.asarray(eye_m + share * along) if share > 0 else None
-
-
-def within_reach(cell: Cell, pose: Floats) -> Floats:
-    """``pose`` (3,) in mm and rad with its position moved to the nearest one (to rounding) that some arm reaches."""
-    if cell.reaches(pose[:2]).any():
-        return pose.copy()
-    candidates = np.concatenate([_of_sector(cell, arm, pose[:2]) for arm in range(cell.num_arms)])
-    reached = candidates[cell.reaches(candidates).any(-1)]
-    nearest = reached[int(np.argmin(np.hypot(*(reached - pose[:2]).T)))]
-    return np.array([*nearest, pose[2]])
-
-
-def _of_sector(cell: Cell, arm: int, point_mm: Floats) -> Floats:
-    """Points (n, 2) of one arm's annulus sector, the nearest to ``point_mm`` among them: on its arcs, its straight edges, its corners."""
-    each = cell.arms[arm]
-    low, high = each.yaw_rad
-    square, yaw = (float(value[arm]) for value in cell.polar(point_mm))
-    radius = math.sqrt(square)
-    at = [(float(np.clip(radius, each.r_min_mm, each.r_max_mm)), float(np.clip(yaw, low, high)))]
-    at += [(float(np.clip(radius * math.cos(yaw - edge), each.r_min_mm, each.r_max_mm)), edge) for edge in (low, high)]
-    return np.array([each.at(r, a) for r, a in at])
-
+from marl_handover.viewer.words import at_once, by_hand, decision_words, number, plain, score_words, state_words, write
 
 RATE_HZ = 50.0
 SPEEDS = (0.25, 4.0)
@@ -181,6 +64,7 @@ class PlayPage:
         self._over_s, self._trouble, self._decision = 0.0, "", ""
         self._wanted, self._loading = "", threading.Lock()
         self._add_controls(speed)
+        self._layout = LayoutPanel(server, cell, self.scene, self.dragged)
 
     def update(self, dt_s: float) -> None:
         """Let ``dt_s`` seconds of wall time pass, and show how things are."""
@@ -254,7 +138,7 @@ class PlayPage:
             return
         x_mm, y_mm, turn_deg = self._numbers.value
         pose = np.array([x_mm, y_mm, math.radians(turn_deg)])
-        if np.isfinite(pose).all() and self._done(self.cell.set_goal(within_reach(self.cell.model.cell, pose))):
+        if np.isfinite(pose).all() and self._done(self.cell.set_goal(within_reach(self.cell.in_order, pose))):
             write(self._auto, False)
         else:
             self._said.pop("goal", None)  # the goal as it is takes the place of what was entered
@@ -273,9 +157,12 @@ class PlayPage:
             dragged = handle.fetch()
             if dragged is None or lost:
                 continue
-            if self._done(move(within_reach(self.cell.model.cell, dragged.pose))):
+            if self._done(move(within_reach(self.cell.in_order, dragged.pose))):
                 obeyed = True
                 write(self._auto, False)
+        trouble = self._layout.obey(lost)
+        if trouble is not None:
+            obeyed, self._trouble = True, trouble
         self._stops = stops
         return obeyed
 
@@ -288,13 +175,13 @@ class PlayPage:
             self.cell.new_problem()
 
     def _show(self, snapshot: Snapshot) -> None:
+        self._layout.show(snapshot)
         self.scene.show_joints(snapshot.joints_rad, snapshot.grip_open)
         self.scene.show_block(snapshot.T_world_block)
         held = self._goal_handle.held
         if held is None:
-            self.scene.show_goal(snapshot.goal)
-        else:
-            self.scene.show_goal(held, bool(self.cell.model.cell.reaches(held[:2]).any()))
+            held = snapshot.goal
+        self.scene.show_goal(held, bool(self.cell.in_order.reaches(held[:2]).any()))
         lies = snapshot.T_world_block[2, 3] < _LYING_MM and snapshot.phase not in _HELD
         self._goal_handle.show(None if self._stopped else snapshot.goal)
         self._block_handle.show(snapshot.block if lies and not self._stopped else None)
@@ -303,10 +190,14 @@ class PlayPage:
 
     def _tell(self, snapshot: Snapshot) -> None:
         """Texts and buttons, where they have changed."""
-        rules = self._policy.rules
+        rules, labels = self._policy.rules, self.cell.model.cell.labels
         if snapshot.plan:
-            self._decision = decision_words(rules, snapshot.plan, snapshot.goal)
-        self._say("state", self._state, f"{state_words(snapshot)}\n\n{plain(snapshot.message)}\n\n{plain(self._trouble)}")
+            self._decision = decision_words(rules, snapshot.plan, snapshot.goal, labels)
+        self._say(
+            "state",
+            self._state,
+            f"{state_words(snapshot, labels)}\n\n{plain(snapshot.message)}\n\n{plain(self._trouble)}\n\n{plain(self._layout.note)}",
+        )
         self._say("score", self._score, score_words(snapshot))
         self._say("last", self._last, f"Last decision: {self._decision}" if self._decision else "")
         label = "go on" if snapshot.state == "paused" else "pause"

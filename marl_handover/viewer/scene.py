@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from marl_handover.arrays import Floats
 from marl_handover.cell import Cell, CellModel
 from marl_handover.config import BlockConfig
+from marl_handover.geometry.capsules import joints_before
+from marl_handover.geometry.se2 import SE2
 from marl_handover.geometry.se3 import transform
 from marl_handover.geometry.urdf import ARM_JOINTS, Joint, Primitive
-from marl_handover.palette import ALERT, GOAL, GREY, INK, SHARED, arm_colour
+from marl_handover.palette import ALERT, FAINT, GOAL, GREY, INK, arm_colour
+from marl_handover.viewer.table import TableNodes
 from marl_handover.viewer.words import UPWARDS, Colour, flat, metres, product, quaternion, rgb, turned
 
 BEECH = (214, 170, 110)
@@ -117,15 +122,42 @@ class ArmNodes:
         self.description, base = model.arms[index].description, model.cell.bases[index]
         self.names = {self.description.root: f"/arm_{index}"}
         yaw = quaternion(UPWARDS, base.facing_rad)
-        server.scene.add_frame(self.names[self.description.root], show_axes=False, wxyz=yaw, position=metres([base.x_mm, base.y_mm, 0.0]))
+        self._root = server.scene.add_frame(
+            self.names[self.description.root], show_axes=False, wxyz=yaw, position=metres([base.x_mm, base.y_mm, 0.0])
+        )
+        self._base = base
+        self._shapes: list[tuple[Any, bool]] = []
+        self._colour: tuple[str, bool] = (arm_colour(index), True)
+        self.standing: list[str] = []
+        """Names of the shapes that stand on the table, or turn on what does."""
         self._frames: dict[str, viser.FrameHandle] = {}
         self._rest: dict[str, Floats] = {}
         for joint in self.description.joints:
             self._add_joint(server, joint)
+        before = joints_before(self.description)
         for link in self.description.links:
-            colour = INK if link.name in DARK_LINKS else arm_colour(index)
+            dark = link.name in DARK_LINKS
             for number, shape in enumerate(link.collisions):
-                _add_shape(server, f"{self.names[link.name]}/shape_{number}", shape, rgb(colour))
+                name = f"{self.names[link.name]}/shape_{number}"
+                self._shapes.append((_add_shape(server, name, shape, rgb(INK if dark else arm_colour(index))), dark))
+                self.standing += [name] if before[link.name] <= 1 else []
+
+    def move(self, base: SE2) -> None:
+        """Stand it somewhere else."""
+        if base != self._base:
+            self._base = base
+            self._root.wxyz, self._root.position = quaternion(UPWARDS, base.facing_rad), metres([base.x_mm, base.y_mm, 0.0])
+
+    def paint(self, colour: str, in_order: bool = True) -> None:
+        """Its links in ``colour``, or in grey if it is out of order."""
+        if self._colour != (colour, in_order):
+            self._colour = colour, in_order
+            for shape, dark in self._shapes:
+                shape.color = rgb((INK if dark else colour) if in_order else FAINT)
+
+    def remove(self) -> None:
+        """Take it out of the scene."""
+        self._root.remove()
 
     def show(self, joints_rad: Sequence[float] | Floats) -> None:
         """Turn the joints (5,)."""
@@ -150,80 +182,21 @@ class ArmNodes:
         self._frames[joint.name] = server.scene.add_frame(name, show_axes=False, wxyz=rest, position=metres(joint.xyz_mm))
 
 
-def _add_shape(server: viser.ViserServer, name: str, shape: Primitive, colour: tuple[int, int, int]) -> None:
+def _add_shape(server: viser.ViserServer, name: str, shape: Primitive, colour: tuple[int, int, int]) -> Any:
     wxyz, position = turned(transform((0.0, 0.0, 0.0), shape.rpy_rad)[:3, :3]), metres(shape.xyz_mm)
     size = metres(shape.size_mm)
     if shape.kind == "box":
-        server.scene.add_box(name, color=colour, dimensions=size, wxyz=wxyz, position=position)
-    elif shape.kind == "cylinder":
-        server.scene.add_cylinder(name, radius=float(size[0]), height=float(size[1]), color=colour, wxyz=wxyz, position=position)
-    else:
-        server.scene.add_icosphere(name, radius=float(size[0]), color=colour, wxyz=wxyz, position=position)
-
-
-WOOD = (240, 238, 233)
-MARGIN_MM = 45.0
-"""Table beyond the last place that an arm reaches."""
-
-# Heights in mm: what is drawn on the table lies in layers, so that no two fight for the same pixels.
-_SHADE_MM, _CHART_MM, _OUTLINE_MM = 0.4, 0.8, 1.2
-_CHART_LINES = 5
-_POINTS = 61
-_NAMES = {"L": "left arm", "R": "right arm"}
-
-
-def add_table(server: viser.ViserServer, cell: Cell) -> None:
-    """Put everything that stays where it is into the scene."""
-    outlines = [sector_outline(cell, arm) for arm in range(cell.num_arms)]
-    corners = np.concatenate([*outlines, [[base.x_mm, base.y_mm] for base in cell.bases]])
-    half = np.abs(corners).max(0) + MARGIN_MM
-    server.scene.add_box("/table", color=WOOD, dimensions=metres([2 * half[0], 2 * half[1], 15.0]), position=metres([0, 0, -7.5]))
-    for arm, outline in enumerate(outlines):
-        _add_line(server, f"/reach_{arm}", outline, arm_colour(arm), _OUTLINE_MM, 1.6)
-        base, name = cell.bases[arm], _NAMES.get(cell.labels[arm], f"arm {cell.labels[arm]}")
-        beyond = 1 + 35.0 / math.hypot(base.x_mm, base.y_mm)
-        server.scene.add_label(f"/name_{arm}", name, position=metres([base.x_mm * beyond, base.y_mm * beyond, 0.0]), anchor="center-center")
-    vertices, faces = shared_mesh(cell)
-    server.scene.add_mesh_simple(
-        "/shared", metres(vertices), faces, color=rgb(SHARED), opacity=0.45, side="double", cast_shadow=False, receive_shadow=False
-    )
-    for number, line in enumerate(chart_lines(cell)):
-        _add_line(server, f"/chart_{number}", line, SHARED, _CHART_MM, 0.7)
-
-
-def sector_outline(cell: Cell, arm: int) -> Floats:
-    """The closed outline (n, 2) in mm of the annulus sector where an arm can pick and place."""
-    each = cell.arms[arm]
-    yaw = np.linspace(*each.yaw_rad, _POINTS)
-    return np.concatenate([each.at(each.r_max_mm, yaw), each.at(each.r_min_mm, yaw[::-1]), each.at(each.r_max_mm, yaw[:1])])
-
-
-def shared_mesh(cell: Cell) -> tuple[Floats, NDArray[np.uint32]]:
-    """Vertices (n, 3) in mm and triangles (m, 3) of the space both arms reach: a strip between its two long sides."""
-    alpha = np.linspace(-1.0, 1.0, _POINTS)
-    sides = np.stack([cell.shared.to_table(alpha, np.full(_POINTS, beta)) for beta in (-1.0, 1.0)], 1).reshape(-1, 2)
-    vertices = np.concatenate([sides, np.full((len(sides), 1), _SHADE_MM)], -1)
-    first = 2 * np.arange(_POINTS - 1)[:, None]
-    faces = np.concatenate([first + [0, 2, 1], first + [1, 2, 3]])
-    return vertices, faces.astype(np.uint32)
-
-
-def chart_lines(cell: Cell) -> list[Floats]:
-    """Lines (n, 2) in mm of constant alpha and of constant beta."""
-    values, along = np.linspace(-1.0, 1.0, _CHART_LINES), np.linspace(-1.0, 1.0, _POINTS)
-    across = np.array([-1.0, 1.0])
-    lines = [cell.shared.to_table(along, np.full(_POINTS, beta)) for beta in values]
-    return lines + [cell.shared.to_table(np.full(2, alpha), across) for alpha in values[1:-1]]
-
-
-def _add_line(server: viser.ViserServer, name: str, points_mm: Floats, colour: str, height_mm: float, width_px: float) -> None:
-    points = metres(np.concatenate([points_mm, np.full((len(points_mm), 1), height_mm)], -1))
-    segments = np.stack([points[:-1], points[1:]], 1)
-    server.scene.add_line_segments(name, segments, colors=rgb(colour), thickness=width_px, thickness_units="screen")
+        return server.scene.add_box(name, color=colour, dimensions=size, wxyz=wxyz, position=position)
+    if shape.kind == "cylinder":
+        return server.scene.add_cylinder(name, radius=float(size[0]), height=float(size[1]), color=colour, wxyz=wxyz, position=position)
+    return server.scene.add_icosphere(name, radius=float(size[0]), color=colour, wxyz=wxyz, position=position)
 
 
 EYE_MM, TARGET_MM, VIEW_DEG = (-640.0, -75.0, 520.0), (0.0, -75.0, 10.0), 42.0
 """The first look: the left arm on the left, and room for the panel on the right."""
+
+PAIR_EXTENT_MM = 410.0
+"""How far a pair reaches from the origin; from more arms the eye is farther away, as they reach farther."""
 
 LAMP_M = (-0.5, 0.3, 0.9)
 
@@ -251,9 +224,13 @@ class CellScene:
         self.server, self.model = server, model
         self._block_config = model.cell.config.block
         self._sent: dict[str, Any] = {}
+        self.generation = 0
+        """How often the nodes of all arms were made anew."""
         with server.atomic():
-            _look(server)
-            add_table(server, model.cell)
+            _look(server, _distance(model.cell))
+            server.on_client_connect(partial(_step_back, _distance(model.cell)))
+            self._table = TableNodes(server)
+            self._table.show(model.cell)
             self._arms = [ArmNodes(server, model, arm) for arm in range(model.cell.num_arms)]
             self._goal = BlockNodes(server, "/goal", self._block_config, rgb(GOAL), opacity=0.3)
             self._goal_label = server.scene.add_label("/goal/label", "goal", position=metres([0, 0, 38.0]), anchor="bottom-center")
@@ -263,6 +240,49 @@ class CellScene:
             self._goal_pose: Floats | None = None
             self._plan = np.zeros((0, 3))
             self._paths = [_add_path(server, arm) for arm in range(model.cell.num_arms)]
+
+    @property
+    def bases(self) -> list[list[str]]:
+        """Names of the nodes that an arm can be dragged by, of each."""
+        return [arm.standing for arm in self._arms]
+
+    @property
+    def discs(self) -> list[str]:
+        """Names of the nodes that discs can be dragged by."""
+        return self._table.discs
+
+    def show_cell(self, model: CellModel, in_order: Sequence[str] | None = None, dials: bool = False) -> None:
+        """Another layout of the cell. Arms that are out of order, those not among ``in_order``, are grey."""
+        changed = [(arm.name, arm.robot) for arm in model.cell.arms] != [(arm.name, arm.robot) for arm in self.model.cell.arms]
+        self.model = model
+        with self.server.atomic():
+            if changed:
+                self._replace_arms()
+            on = model.cell.names if in_order is None else in_order
+            for index, (node, arm) in enumerate(zip(self._arms, model.cell.arms, strict=True)):
+                node.move(arm.base)
+                node.paint(arm_colour(index), arm.name in on)
+            standing = model.cell if in_order is None else model.cell.with_arms(on)
+            self._table.show(model.cell, standing, dials)
+
+    def show_bases(self, bases: Sequence[SE2]) -> None:
+        """Where the cell's arms are held that cannot stand so: what each reaches there, in red."""
+        arms = [replace(arm, base=base) for arm, base in zip(self.model.cell.arms, bases, strict=True)]
+        with self.server.atomic():
+            for node, base in zip(self._arms, bases, strict=True):
+                node.move(base)
+            self._table.show_arms(arms, self.model.cell.labels, allowed=False)
+
+    def _replace_arms(self) -> None:
+        """Arms have come or gone."""
+        self.generation += 1
+        for node in self._arms:
+            node.remove()
+        for path in self._paths:
+            path.remove()
+        self._sent = {key: value for key, value in self._sent.items() if not key.startswith(("joints", "grip", "plan"))}
+        self._arms = [ArmNodes(self.server, self.model, arm) for arm in range(self.model.cell.num_arms)]
+        self._paths = [_add_path(self.server, arm) for arm in range(self.model.cell.num_arms)]
 
     def show_joints(self, joints_rad: ArrayLike, grip_open: Sequence[bool] | None = None) -> None:
         """Pose all arms.
@@ -368,9 +388,30 @@ def place_names(plan: Floats, goal: Floats | None) -> list[str | None]:
     return [*names, f"goal ({', '.join(at_goal)})" if at_goal else "goal"]
 
 
-def _look(server: viser.ViserServer) -> None:
+def _step_back(far: float, client: viser.ClientHandle) -> None:
+    """On a screen that is higher than wide, a phone's, the panel is below: the eye is farther away, the cell higher in the picture."""
+    camera = client.camera
+    if camera.aspect < 1.0:
+        away = far * min(1.0 / camera.aspect, MOST_AWAY)
+        target = away * metres([_LOWER * EYE_MM[0], 0.0, 0.0])
+        with client.atomic():
+            camera.position = target + away * metres([EYE_MM[0], 0.0, EYE_MM[2]])
+            camera.look_at = target  # after the position, which takes it along
+
+
+MOST_AWAY = 2.2
+_LOWER = 0.3
+"""Of the distance of the eye: how much nearer to it than the middle of the table a phone looks."""
+
+
+def _distance(cell: Cell) -> float:
+    """How far away the eye is, in distances from a pair."""
+    return 1.0 if cell.num_arms == 2 else max(1.0, max(cell.extent_mm) / PAIR_EXTENT_MM)
+
+
+def _look(server: viser.ViserServer, away: float) -> None:
     camera, scene = server.initial_camera, server.scene
-    camera.position, camera.look_at, camera.fov = metres(EYE_MM), metres(TARGET_MM), math.radians(VIEW_DEG)
+    camera.position, camera.look_at, camera.fov = away * metres(EYE_MM), away * metres(TARGET_MM), math.radians(VIEW_DEG)
     # viser's own lights bleach colours, which mean something here.
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map(None)

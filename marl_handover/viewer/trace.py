@@ -22,7 +22,7 @@ from marl_handover.motion.trajectory import LOADED_PHASES
 from marl_handover.task.rules import Rules
 from marl_handover.viewer.scene import CellScene
 from marl_handover.viewer.trace_file import Moment, Recorded, Step, Trace
-from marl_handover.viewer.words import arm_name, by_hand, degrees_words, error_words, number, place_words, plain, write
+from marl_handover.viewer.words import arm_words, by_hand, degrees_words, error_words, number, place_words, plain, write
 
 STRAIGHT_S = 1.5
 _STRAIGHT_SAMPLES = 31
@@ -62,7 +62,7 @@ class Motions:
 
     def __init__(self, model: CellModel, motion: MotionConfig | None = None, kept: int = 32) -> None:
         self.model, self._kept = model, kept
-        self.planner = MotionPlanner(model, motion)
+        self.planner = MotionPlanner(model.without_obstacles(), motion)
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="motions")
         self._made: OrderedDict[int, Future[Motion]] = OrderedDict()
 
@@ -309,7 +309,7 @@ def moment_words(rules: Rules, trace: Trace, moment: Moment, steps: list[Step]) 
         return "\n\n".join(lines)
     step = steps[moment.done - 1]
     where = "to the goal" if step.final else f"to a hand-over at {place_words(step.place_mm)}"
-    lines.append(f"{arm_name(step.arm)} {where}" + (f": {plain(step.trouble)}" if step.trouble else ""))
+    lines.append(f"{plain(arm_words(rules.cell.labels[step.arm]))} {where}" + (f": {plain(step.trouble)}" if step.trouble else ""))
     lines.append(f"from the goal: {error_words(rules, step.next_state, step.goal)} ({degrees_words(step.epsilon_rad)} allowed)")
     if step.outcome:
         lines.append(STUCK if step.nobody else RESULTS[step.outcome])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 from marl_handover.arrays import Floats
 from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.envs.cycle_check import Refusal
-from marl_handover.errors import CorruptFile, InvalidSetting
+from marl_handover.errors import CorruptFile, InvalidSetting, listed
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.parsing import read_rows
 from marl_handover.task.rules import Outcome
@@ -105,8 +106,22 @@ class Trace:
         return int(self._first_moments[episode])
 
 
-def read_trace(path: Path) -> Trace:
+def recorded_cell(path: Path) -> dict[str, Any] | None:
+    """Settings of the cell that a session's log says it is of; None: it is a trace of ``evaluate``. Raises as :func:`read_trace`."""
+    for _, row in read_rows(path, WHAT):
+        if "event" not in row:
+            break
+        if row["event"] == "session" and isinstance(row.get("cell"), dict):
+            return dict(row["cell"])
+    return None
+
+
+def read_trace(path: Path, labels: Sequence[str] = ARM_LETTERS) -> Trace:
     """The trace in ``path``: of ``evaluate``, or of a session's log.
+
+    Args:
+        path: of the file.
+        labels: what it calls the cell's arms.
 
     Raises:
         MissingFile, CorruptFile: with the number of the line.
@@ -114,7 +129,7 @@ def read_trace(path: Path) -> Trace:
     steps: list[Step] = []
     starts: list[int] = []
     names: list[int] = []
-    cell, order, session = None, None, _Session()
+    cell, order, session = None, None, _Session(len(labels))
     for number, row in read_rows(path, WHAT):
         try:
             name = session.take(row) if "event" in row else int(row["episode"])
@@ -123,7 +138,7 @@ def read_trace(path: Path) -> Trace:
             order = _order(row, order)
             if "event" in row and row["event"] != "transfer":
                 continue
-            step = _step(row, session.recorded())
+            step = _step(row, session.recorded(), labels)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise CorruptFile(WHAT, path, f"line {number} is no transfer as 'evaluate trace=FILE' writes it: {_reason(error)}") from error
         if not names or name != names[-1]:
@@ -138,8 +153,8 @@ def read_trace(path: Path) -> Trace:
 class _Session:
     """What a session's log has told so far: the number of its episode, and what the arms were sent since the last transfer."""
 
-    def __init__(self) -> None:
-        self.episode = -1
+    def __init__(self, arms: int) -> None:
+        self.episode, self._arms = -1, arms
         self._sent: list[tuple[float, Floats, Floats]] = []
 
     def take(self, row: dict[str, Any]) -> int:
@@ -149,7 +164,7 @@ class _Session:
             self.episode += 1
             self._sent = []
         if event == "state":
-            arms = len(ARM_LETTERS)
+            arms = self._arms
             t_s = float(_numbers(row["t_s"], ()))
             if self._sent and t_s < self._sent[-1][0]:
                 raise ValueError(f"t_s = {t_s} goes back")
@@ -165,7 +180,7 @@ class _Session:
         return Recorded(t_s - t_s[0], joints, gripper)
 
 
-def _step(row: dict[str, Any], recorded: Recorded | None) -> Step:
+def _step(row: dict[str, Any], recorded: Recorded | None, labels: Sequence[str]) -> Step:
     state, goal, next_state = (_numbers(row[key], (3,)) for key in ("state", "goal", "next_state"))
     outcome = row["outcome"]
     if outcome is not None and outcome not in OUTCOMES:
@@ -178,9 +193,10 @@ def _step(row: dict[str, Any], recorded: Recorded | None) -> Step:
     epsilon_rad = float(row["epsilon_rad"])
     if not math.isfinite(epsilon_rad):
         raise ValueError("epsilon_rad is not finite")
-    if row["arm"] not in ARM_LETTERS:
-        raise ValueError(f"its arm is {str(row['arm'])[:40]!r}, and pages show a pair of arms, {' and '.join(ARM_LETTERS)}")
-    arm, place = ARM_LETTERS.index(row["arm"]), _numbers(row["place"], (2,))
+    if row["arm"] not in labels:
+        said = f"its arm is {str(row['arm'])[:40]!r}, and those of the cell are {listed(labels)}"
+        raise ValueError(f"{said}; say in which cell it was recorded: cell=NAME or cell=FILE.yaml")
+    arm, place = labels.index(row["arm"]), _numbers(row["place"], (2,))
     return Step(state, goal, arm, row["final"], place, next_state, outcome or "", epsilon_rad, trouble, recorded)
 
 

@@ -84,7 +84,7 @@ def at_once(act: Callable[[], object]) -> Callable[[Any], Coroutine[Any, Any, No
     return act_now
 
 
-ARM_NAMES = {"L": "left arm", "R": "right arm"}
+ARM_NAMES = {"L": "left arm", "R": "right arm", "left": "left arm", "right": "right arm"}
 
 DOING = {
     "approach": "goes to the block",
@@ -102,7 +102,8 @@ STATES = {
     "paused": "Paused.",
     "stopped": "STOPPED. Nothing moves until the stop is cleared.",
     "done": "Done: the block is at its goal.",
-    "stuck": "Stuck: the policy knows no way to the goal.",
+    "stuck": "Stuck: there is no way to the goal, or the policy knows none.",
+    "broken": "The arms wait: the cell cannot be like this.",
 }
 
 _MARKUP = frozenset("<>&[]*_`~|\\#!+-.)")
@@ -114,10 +115,9 @@ def plain(text: str) -> str:
     return " ".join("".join(f"&#{ord(sign)};" if sign in _MARKUP else sign for sign in text).split())
 
 
-def arm_name(arm: int) -> str:
-    """Of an index."""
-    letter = ARM_LETTERS[arm]
-    return ARM_NAMES.get(letter, f"arm {letter}")
+def arm_words(label: str) -> str:
+    """An arm, by what traces and pictures call it."""
+    return ARM_NAMES.get(label, f"arm {label}")
 
 
 def degrees_words(angle_rad: float) -> str:
@@ -138,20 +138,21 @@ def error_words(rules: Rules, pose: ArrayLike, goal: ArrayLike) -> str:
     return f"{math.hypot(*(here[:2] - there[:2])):.1f} mm, {turned:.1f}°"
 
 
-def state_words(snapshot: Snapshot) -> str:
-    """What is going on."""
+def state_words(snapshot: Snapshot, labels: Sequence[str] = ARM_LETTERS) -> str:
+    """What is going on; ``labels``: of the arms."""
     if snapshot.state == "moving" and snapshot.arm >= 0:
-        doing = DOING.get(snapshot.phase, "moves")
-        return f"**The {arm_name(snapshot.arm)} {doing}.**"
+        doing, label = DOING.get(snapshot.phase, "moves"), labels[snapshot.arm]
+        who = f"The {arm_words(label)}" if label in ARM_NAMES else f"Arm {plain(label)}"
+        return f"**{who} {doing}.**"
     return f"**{STATES.get(snapshot.state, snapshot.state)}**"
 
 
-def decision_words(rules: Rules, plan: Sequence[Placement], goal: ArrayLike) -> str:
-    """The next placement, and what the policy expects of its plan in the end."""
+def decision_words(rules: Rules, plan: Sequence[Placement], goal: ArrayLike, labels: Sequence[str] = ARM_LETTERS) -> str:
+    """The next placement, and what the policy expects of its plan in the end; ``labels``: of the arms."""
     first, last = plan[0], plan[-1]
     where = "to the goal" if first.final else f"to a hand-over at {place_words(first.pose)}"
     foreseen = f"{error_words(rules, last.pose, goal)} from the goal after {counted(len(plan), 'transfer')}"
-    return f"{arm_name(first.arm)} {where}; foreseen: {foreseen}, {degrees_words(rules.epsilon_rad)} allowed"
+    return f"{plain(arm_words(labels[first.arm]))} {where}; foreseen: {foreseen}, {degrees_words(rules.epsilon_rad)} allowed"
 
 
 def score_words(snapshot: Snapshot) -> str:

@@ -61,7 +61,7 @@ def serving():
 
 @pytest.fixture(scope="session")
 def opened() -> Iterator[Callable[[str], object]]:
-    """``opened(address)``: the page in a headless browser, 1280 x 720."""
+    """``opened(address)``: the page in a headless browser, 1280 x 720; the one before is closed."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     path = next((found for found in map(shutil.which, BROWSERS) if found), None)
     if path is None:
@@ -70,6 +70,8 @@ def opened() -> Iterator[Callable[[str], object]]:
         browser = play.chromium.launch(executable_path=path, args=list(OPTIONS))
 
         def make(address: str):
+            for old in [page for context in browser.contexts for page in context.pages]:
+                old.close()
             page = browser.new_page(viewport={"width": 1280, "height": 720})
             page.set_default_timeout(60_000)
             page.goto(address)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from viewer_client import Client
 from viser import _messages
 
-from marl_handover.viewer.play import PlaneHandle, on_level
+from marl_handover.viewer.handles import PlaneHandle, on_level
 from marl_handover.viewer.server import address
 from marl_handover.viewer.words import flat
 

@@ -144,5 +144,7 @@ def test_a_file_without_a_transfer_and_one_that_is_not_there_are_named(written, 
 def test_a_trace_of_other_arms_than_a_pairs_says_so(tmp_path):
     path = tmp_path / "trace.jsonl"
     path.write_text(json.dumps({**LINE, "arm": "north", "receiver": "west"}) + "\n")
-    with pytest.raises(CorruptFile, match="its arm is 'north', and pages show a pair of arms, L and R"):
+    with pytest.raises(
+        CorruptFile, match="its arm is 'north', and those of the cell are L, R; say in which cell it was recorded: cell=NAME"
+    ):
         read_trace(path)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from marl_handover.cell import load_cell
 from marl_handover.task.problems import sample_positions
-from marl_handover.viewer.play import within_reach
+from marl_handover.viewer.handles import within_reach
 
 CELL = load_cell("paper")
 far = st.floats(-900, 900)

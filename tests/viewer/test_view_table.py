@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from marl_handover.viewer.scene import add_table, chart_lines, sector_outline, shared_mesh
+from marl_handover.viewer.table import TableNodes, chart_lines, sector_outline, shared_mesh
 
 INNER = 0.999  # a little off the edges, where floats decide
 
@@ -41,7 +41,7 @@ def test_chart_lines_stay_in_the_shared_space(paper):
 
 
 def test_the_table_is_under_everything_an_arm_reaches(server, paper):
-    add_table(server, paper)
+    TableNodes(server).show(paper)
     table = server.scene.get_handle_by_name("/table")
     half = 500 * np.asarray(table.dimensions)
     for arm in range(2):

@@ -16,13 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from marl_handover.arrays import Floats, wrap
+from marl_handover.cell import Cell
 from marl_handover.cell.build import CellModel
-from marl_handover.config import MotionConfig, require_at_least, require_seed
+from marl_handover.config import CellConfig, MotionConfig, require_at_least, require_seed
 from marl_handover.control.interactive.controller import InteractiveController, Placement, PolicyAdapter
 from marl_handover.control.interactive.world_state import projected
-from marl_handover.errors import InvalidSetting, NotFinite
+from marl_handover.errors import HandoverError, InvalidSetting, NotFinite
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.policies import SupervisorPolicy
+from marl_handover.task.rules import Rules
 
 __all__ = ["InteractiveCell", "Placement", "Snapshot"]
 
@@ -40,7 +42,7 @@ class Snapshot(NamedTuple):
         T_world_block: (4, 4) in mm, of the middle of the block's underside, x along its yaw.
         block: (3,) x_mm, y_mm, yaw_rad of the block seen from above, also while it is carried.
         goal: (3,).
-        state: waiting, moving, paused, stopped, done or stuck.
+        state: waiting, moving, paused, stopped, broken, done or stuck.
         arm: the moving arm, -1 for none.
         phase: approach, grasp, lift, transfer, lower, release, retreat; "" if nothing moves.
         plan: the placements to come, by the policy's own rollout on the rule book.
@@ -76,24 +78,29 @@ class _Wishes:
     goal: Floats | None = None
     block: Floats | None = None
     adapter: PolicyAdapter | None = None
+    policy: SupervisorPolicy | None = None
+    layout: CellConfig | None = None
     problem: int | None = None
     since: float = math.nan
 
 
 class InteractiveCell:
-    """Two exact arms, a block and a goal to play with.
+    """Exact arms, a block and a goal to play with.
 
     An arm whose hand is empty brakes and goes for what is decided now. A block in the hand keeps its orientation to the hand, so the
     decision is made from where it was picked up: if it names the same arm, the hand turns to the new place in mid-air; else the block is
     put down where it was going, or back where it came from if that leaves fewer transfers. A block dragged out of the hand is taken from
     it. A block dragged to where an arm is, or cannot be kept off, stays where it was.
 
-    While paused or stopped, simulated time stands still. A stop is latched: :meth:`resume` does nothing until :meth:`clear`, after
+    The cell itself may be changed, too, if its policy acts in any cell: :meth:`set_layout`. Where a layout cannot be, the state is broken,
+    the message says why, and nothing moves until one comes that can. Obstacles keep blocks off; arms do not go around them.
+
+    While paused, stopped or broken, simulated time stands still. A stop is latched: :meth:`resume` does nothing until :meth:`clear`, after
     which the cell is paused; clearing alone moves nothing. What is wished before the clear, and was not begun at the stop, is dropped.
 
     Args:
         policy: the supervisor.
-        model: its cell.
+        model: its cell, in which arms that are out of order stand, too.
         motion: how the arms move.
         seed: of the problems; the first one is there at once.
 
@@ -104,9 +111,11 @@ class InteractiveCell:
     def __init__(self, policy: SupervisorPolicy, model: CellModel, motion: MotionConfig | None = None, seed: int = 0) -> None:
         require_seed(seed)
         self.model, self.motion = model, motion or MotionConfig()
-        planner = MotionPlanner(model, self.motion)
+        planner = MotionPlanner(model.without_obstacles(), self.motion)
         planner.warm_up()
         self._controller = InteractiveController(PolicyAdapter(policy, model, self.motion), model, planner, seed)
+        self._policy, self._layout, self._fault = policy, policy.rules.cell.config, ""
+        self._first = self._layout, model, planner
         self._lock, self._advancing = threading.Lock(), threading.Lock()
         self._wishes, self._paused, self._stopped = _Wishes(), False, False
         self.stops = 0
@@ -131,8 +140,34 @@ class InteractiveCell:
         return self._wish(block=self._checked("block", pose))
 
     def set_policy(self, policy: SupervisorPolicy) -> bool:
-        """Another supervisor. Returns as :meth:`set_goal`; raises :class:`InvalidSetting` as the constructor does."""
-        return self._wish(adapter=PolicyAdapter(policy, self.model, self.motion))
+        """Another supervisor. Returns as :meth:`set_goal`; raises :class:`InvalidSetting` as the constructor does.
+
+        In a layout that was set it is put under the rule book of that, and the state is broken if it cannot be.
+        """
+        policy.require_executors()
+        adapter = None if self._relaid else PolicyAdapter(policy, self.model, self.motion)
+        return self._wish(adapter=adapter, policy=policy)
+
+    def set_layout(self, config: CellConfig) -> bool:
+        """Other places of arms, other arms or obstacles, some arms out of order: spaces, optimum, plan and motion follow at once.
+
+        Arms that stay where they are go on from there; those that do not are parked. Returns as :meth:`set_goal`.
+        """
+        return self._wish(layout=config)
+
+    def kept_clear(self) -> Floats:
+        """Places (2, 2) of block and goal, which nothing new is to be put on."""
+        return np.stack([self._controller.world.pose[:2], self._controller.goal[:2]])
+
+    @property
+    def layout(self) -> CellConfig:
+        """The layout that was taken up last, also if it cannot be."""
+        return self._layout
+
+    @property
+    def in_order(self) -> Cell:
+        """The cell of the arms that are in order."""
+        return self._controller.adapter.rules.cell
 
     def new_problem(self, seed: int | None = None) -> bool:
         """A random block and goal: those of ``seed``, else the next ones. An episode under way is given up, and not counted.
@@ -203,8 +238,17 @@ class InteractiveCell:
         """Do what was wished."""
         controller = self._controller
         changed = block_moved = False
-        if wishes.adapter is not None:
+        self._policy = wishes.policy or self._policy
+        if wishes.layout is not None or (wishes.policy is not None and self._relaid):
+            self._lay_out(wishes.layout or self._layout)
+            self._since = wishes.since
+        elif wishes.adapter is not None:
             controller.adapter, changed = wishes.adapter, True
+        if self._fault:
+            controller.goal = controller.goal if wishes.goal is None else wishes.goal
+            if wishes.block is not None:
+                controller.world.put(wishes.block)
+            return
         if wishes.problem is not None and controller.pose_problem(None if wishes.problem == NEXT else wishes.problem):
             changed = block_moved = True
         if wishes.goal is not None:
@@ -215,16 +259,47 @@ class InteractiveCell:
             controller.replan(block_moved)
             self._since = wishes.since
 
+    def _lay_out(self, config: CellConfig) -> None:
+        """Take up a layout, or note why it cannot be."""
+        self._layout = config
+        try:
+            model, planner, policy = self._laid(config)
+            adapter = PolicyAdapter(policy, model, self.motion)
+        except HandoverError as error:
+            self._fault = str(error)
+            return
+        self.model, self._fault = model, ""
+        self._controller.lay_out(adapter, planner)
+
+    def _laid(self, config: CellConfig) -> tuple[CellModel, MotionPlanner, SupervisorPolicy]:
+        """Cell, planner and policy of a layout. Raises whatever cannot be."""
+        first, model, planner = self._first
+        if config == first:
+            return model, planner, self._policy
+        model = self.model.relaid(config)
+        planner = self._controller.programs.paths.planner.relaid(model.without_obstacles())
+        if not self._policy.any_cell:
+            choices = "one for every cell, as exact, greedy, random or pretrained_any, once arms or obstacles are changed"
+            raise InvalidSetting("policy", self._policy.name, choices)
+        cell = model.cell if config.enabled is None else model.cell.with_arms(config.enabled)
+        rules = Rules(cell.with_inset(self._policy.rules.cell.config.chart_inset), self._policy.rules.config)
+        return model, planner, self._policy.under(rules)
+
+    @property
+    def _relaid(self) -> bool:
+        """Whether the cell is not, or is not to be, the one that it was made with."""
+        return bool(self._fault) or self.model is not self._first[1]
+
     def _step(self, dt_s: float, passed_s: float) -> float:
         """Move for ``dt_s`` while ``passed_s`` pass, if time does pass; what is left of ``dt_s`` when nothing moves any more."""
         with self._lock:
-            if self._paused:
+            if self._paused or self._fault:
                 return 0.0
             self._t_s += passed_s
             return self._controller.step(dt_s)
 
     def _idle(self) -> bool:
-        return not (self._paused or self._controller.moving or self._controller.ended)
+        return not (self._paused or self._fault or self._controller.moving or self._controller.ended)
 
     def _wish(self, **wish: object) -> bool:
         with self._lock:
@@ -239,7 +314,8 @@ class InteractiveCell:
             raise InvalidSetting(what, np.shape(pose), "three numbers: x_mm, y_mm, yaw_rad")
         if not np.isfinite(array).all():
             raise NotFinite(what, array.tolist())
-        self.model.cell.require_reached(what, array)
+        if not self._fault:
+            self.in_order.require_reached(what, array)
         array[2] = wrap(array[2])
         return array
 
@@ -262,7 +338,7 @@ class InteractiveCell:
             controller.score.episodes,
             controller.score.solved,
             controller.score.ratio,
-            controller.message,
+            self._fault or controller.message,
         )
 
     def _state(self) -> str:
@@ -270,6 +346,8 @@ class InteractiveCell:
             return "stopped"
         if self._paused:
             return "paused"
+        if self._fault:
+            return "broken"
         if self._controller.moving:
             return "moving"
         return self._controller.ended or "waiting"

@@ -13,11 +13,10 @@ import torch
 from marl_handover.arrays import Floats
 from marl_handover.cell import NO_ARM, Cell
 from marl_handover.cell.build import CellModel
-from marl_handover.cell.symmetry import ARM_LETTERS
 from marl_handover.config import LoopConfig, MotionConfig
 from marl_handover.control.closed_loop import finish_command, transfer_command
 from marl_handover.control.interactive.motion_program import FreePaths, MotionPrograms
-from marl_handover.control.interactive.world_state import WorldState
+from marl_handover.control.interactive.world_state import WorldState, projected
 from marl_handover.control.transfers import SAME_MM, Placement, TransferCommand, rollout
 from marl_handover.errors import InvalidSetting, WorkFailed, counted
 from marl_handover.motion.path_length_table import motion_cost
@@ -26,7 +25,7 @@ from marl_handover.policies import SupervisorPolicy
 from marl_handover.task.episode import nobody_moves
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import sample_problems
-from marl_handover.task.rules import Outcome, Rules, carried
+from marl_handover.task.rules import Outcome, Rules
 
 MOST_TRANSFERS = LoopConfig().transfers
 """An episode that takes more is given up."""
@@ -39,6 +38,8 @@ def _reaches(cell: Cell) -> list[tuple[Any, ...]]:
 
 class PolicyAdapter:
     """A policy under the exact rule book of the cell.
+
+    Arms are counted as the cell has them; those that are out of order for the policy stand in it, and do nothing.
 
     Args:
         policy: the supervisor.
@@ -53,8 +54,11 @@ class PolicyAdapter:
         policy.require_executors()
         own = policy.rules.cell.config
         cell = model.cell.with_inset(own.chart_inset)
+        if own.enabled is not None:
+            cell = cell.with_arms(own.enabled)
         if _reaches(cell) != _reaches(policy.rules.cell):
             raise InvalidSetting("policy", policy.name, f"one for the cell {model.cell.config.name!r}; this one is for {own.name!r}")
+        self.cell = model.cell
         self.rules = Rules(cell, policy.rules.config, motion_cost(cell, policy.rules.config, motion))
         self.policy = policy.under(self.rules)
         self.exact = ExactPlanner(self.rules)
@@ -64,15 +68,20 @@ class PolicyAdapter:
 
         Architecture A's final transfer, where an arm can do it, comes before the policy's wishes.
         """
-        if (finish := finish_command(self.rules, pose, goal)) is not None:
-            return finish
-        action = self.policy.act(pose, goal, np.asarray(previous))
-        return None if bool(nobody_moves(action)) else transfer_command(self.rules, pose, goal, action)
+        command = finish_command(self.rules, pose, goal)
+        if command is None:
+            if self.rules.cell.config.enabled is not None and self.why_unsolvable(pose, goal):
+                return None
+            action = self.policy.act(pose, goal, self.rules.cell.numbered(previous, self.cell))
+            if bool(nobody_moves(action)):
+                return None
+            command = transfer_command(self.rules, pose, goal, action)
+        arm, receiver = self.cell.numbered([command.arm, command.receiver], self.rules.cell).tolist()
+        return command._replace(arm=arm, receiver=receiver)
 
-    def placed(self, pose: Floats, arm: int, place_mm: Floats) -> Floats:
-        """Pose (3,) of a block that ``arm`` takes from ``pose`` to ``place_mm`` (2,)."""
-        turn = self.rules.cell.polar(place_mm)[1][arm] - self.rules.cell.polar(pose)[1][arm]
-        return np.asarray(carried(pose, place_mm, turn), float)
+    def why_unsolvable(self, pose: Floats, goal: Floats) -> str:
+        """Why the arms that are in order cannot bring the block from ``pose`` (3,) to ``goal`` (3,); empty if they can."""
+        return "" if self.there(pose, goal) else self.exact.unsolvable_because(pose, goal)
 
     def there(self, pose: Floats, goal: Floats) -> bool:
         """Whether a block at ``pose`` (3,) is at the goal."""
@@ -88,7 +97,7 @@ class PolicyAdapter:
             return ()
         plan = [Placement(first.predicted, first.arm, first.final)]
         if not self.there(first.predicted, goal):
-            plan += rollout(self.policy, first.predicted, goal, first.arm)
+            plan += rollout(self.policy, first.predicted, goal, first.arm, self.cell)
         return tuple(plan[: self.rules.config.max_steps])
 
 
@@ -174,9 +183,9 @@ class InteractiveController:
         for arm, joints in enumerate(world.joints_rad):
             samples = self.programs.stop(world).joints_rad if arm == world.arm else joints[None]
             if not (paths.parked(arm, joints) or paths.clear_of_block(arm, samples, block[:2])):
-                self.message = f"arm {ARM_LETTERS[arm]} is in the way there"
+                self.message = f"arm {self._label(arm)} is in the way there"
                 return False
-        self.message = f"block taken from the hand of {ARM_LETTERS[world.arm]}" if world.held else "block moved"
+        self.message = f"block taken from the hand of {self._label(world.arm)}" if world.held else "block moved"
         world.put(block)
         return True
 
@@ -197,6 +206,49 @@ class InteractiveController:
                 self._helpless(failure)
         if self.programs.paths.planned == planned:
             self.prepare()
+
+    def lay_out(self, adapter: PolicyAdapter, planner: MotionPlanner) -> None:
+        """The cell is another one: decide afresh, and go on from where the arms are that stay; plans a path or two.
+
+        Arms that stand elsewhere now are parked at once. What they held lies where it was seen from above, if an arm reaches that.
+        """
+        before, world = self.world, self.world.relaid(planner.model, planner.homes_rad)
+        if before.held and not world.held:
+            seen = projected(before.T_world_block())
+            world.put(seen if adapter.rules.cell.reaches(seen[:2]).any() else before.pose)
+        self._previous = int(planner.model.cell.numbered(self._previous, before.model.cell))
+        if self._command is not None:
+            self._command = self._command._replace(arm=int(planner.model.cell.numbered(self._command.arm, before.model.cell)))
+        self.adapter, self.programs, self.world = adapter, MotionPrograms(FreePaths(planner)), world
+        self._reopen()
+        try:
+            if not world.program:
+                self.proceed()
+                self.prepare()
+            elif world.held:
+                self._replan_held(anew=True)
+            else:
+                self._command = self._next_command(world.pose, self._previous)
+                world.start(self.programs.redirected(world, self._command, True))
+                self._show()
+        except WorkFailed:
+            self._park()
+            self.prepare()
+
+    def _park(self) -> None:
+        """All arms are put into their parked poses by hand, and go on from there."""
+        world, arm = self.world, self.world.arm
+        if world.held:
+            seen = projected(world.T_world_block())
+            world.put(seen if self.adapter.rules.cell.reaches(seen[:2]).any() else world.pose)
+        world.program.clear()
+        world.joints_rad[:], world.opened[:] = self.programs.paths.homes_rad, 1.0
+        self.ended = ""
+        self.proceed()
+        self.message = f"{self._label(arm)} had no way on, and was parked by hand; {self.message}"
+
+    def _label(self, arm: int) -> str:
+        return self.adapter.cell.labels[arm]
 
     def proceed(self) -> None:
         """Nothing moves: the next transfer, if there is one."""
@@ -237,7 +289,7 @@ class InteractiveController:
         if self.adapter.there(command.predicted, self.goal):
             self._conclude(DONE, f"at the goal after {counted(self.transfers, 'transfer')}, optimum {self.optimal}")
         else:
-            self.message = f"{ARM_LETTERS[command.arm]} has put the block down"
+            self.message = f"{self._label(command.arm)} has put the block down"
 
     def _next_command(self, pose: Floats, previous: int) -> TransferCommand | None:
         """The next order, one that can be carried out; None: the episode has ended."""
@@ -248,30 +300,35 @@ class InteractiveController:
         while self.transfers < MOST_TRANSFERS:
             command = self.adapter.command(pose, self.goal, previous)
             if command is None:
-                self._conclude(STUCK, "the policy wants no arm to move")
+                self._conclude(STUCK, self.adapter.why_unsolvable(pose, self.goal) or "the policy wants no arm to move")
                 return None
             if command.feasible:
                 return command
             self.transfers += 1
             if refused is not None and _same(refused, command):
-                self._conclude(STUCK, f"the policy orders what arm {ARM_LETTERS[command.arm]} cannot reach")
+                self._conclude(STUCK, f"the policy orders what arm {self._label(command.arm)} cannot reach")
                 return None
             refused = command
         self._conclude(STUCK, f"not solved in {MOST_TRANSFERS} transfers")
         return None
 
-    def _replan_held(self) -> None:
-        """The block is in the hand: what it was picked up for may have changed."""
+    def _replan_held(self, anew: bool = False) -> None:
+        """The block is in the hand: what it was picked up for may have changed. ``anew``: so has what is around the arm.
+
+        Raises :class:`WorkFailed` if there is no way on; unless ``anew`` the arm goes on as it does.
+        """
         world, mine = self.world, self._command
         assert mine is not None
         # Where it was picked up may be the goal by now: then it is put back.
         wanted = None if self.adapter.there(world.pose, self.goal) else self._next_command(world.pose, self._previous)
         target = wanted if wanted is not None and wanted.arm == world.arm else self._put_down(mine)
         trouble = ""
-        if not np.array_equal(target.place_mm, mine.place_mm):
+        if anew or not np.array_equal(target.place_mm, mine.place_mm):
             try:
                 world.start(self.programs.diverted(world, target))
             except WorkFailed as failure:
+                if anew:
+                    raise
                 target, trouble = mine._replace(final=False), f"the block goes on to where it was going: {failure}"
         self._command = target
         self._show()
@@ -325,7 +382,7 @@ class InteractiveController:
         self.plan = self.adapter.rollout(self.world.pose, self.goal, self._previous, command)
         if command is not None and not self.ended:
             what = "to the goal" if command.final else f"to ({command.place_mm[0]:z.0f}, {command.place_mm[1]:z.0f}) mm"
-            self.message = f"{ARM_LETTERS[command.arm]} takes the block {what}"
+            self.message = f"{self._label(command.arm)} takes the block {what}"
 
 
 def _same(one: TransferCommand, other: TransferCommand) -> bool:

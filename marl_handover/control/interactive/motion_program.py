@@ -142,11 +142,7 @@ class FreePaths:
         self.planned = 0
         self.limits = tuple(motion_limits(arm, self.motion) for arm in planner.model.arms)
         """Velocity and acceleration limits (5,) of each arm, in rad/s and rad/s^2."""
-        self._empty, self._loaded = [], []
-        for index, arm in enumerate(planner.model.cell.arms):
-            ahead, others = arm.base.to_world([(arm.r_min_mm + arm.r_max_mm) / 2, 0.0]), planner.others_home_rad(index)
-            self._empty.append(planner.reaching(index, self.homes_rad[index], ahead, others, leaving=True)[0])
-            self._loaded.append(planner.carrying(index, ahead, ahead, others)[0])
+        self._segments: dict[tuple[int, bool], Segment] = {}
 
     def parked(self, arm: int, joints_rad: Floats) -> bool:
         """Whether an arm at ``joints_rad`` (5,) is parked."""
@@ -194,7 +190,7 @@ class FreePaths:
         share = min(1.0, distance / (2 * motion.lift_scale_mm))
         scale, lift_mm = share * motion.lift_scale_mm, share * motion.lift_mm
         profile = np.array([*ends_mm[0], *ends_mm[1], scale, scale, lift_mm, share * motion.ground_clearance_mm])
-        loaded, body = self._loaded[arm], planner.collision_models[arm]
+        loaded, body = self._segment(arm, loaded=True), planner.collision_models[arm]
         bound = string_length(distance, scale, lift_mm)
         expected = bound + detour_length(ends_mm, proportions(body.planar).grip_least_mm)
         segment = replace(loaded, ends=ends, scene=loaded.scene._replace(profile=profile), lower_bound_mm=distance, expected_mm=expected)
@@ -203,7 +199,7 @@ class FreePaths:
 
     def clear_of_block(self, arm: int, joints_rad: Floats, block_mm: Floats) -> bool:
         """Whether an arm at all of ``joints_rad`` (n, 5), its hand empty, keeps off a block lying at ``block_mm`` (2,)."""
-        segment = self._around_block(arm, block_mm, joints_rad[[0, -1], :4], self._empty[arm].scene.profile)
+        segment = self._around_block(arm, block_mm, joints_rad[[0, -1], :4], self._segment(arm, loaded=False).scene.profile)
         margins, _ = segment.check(joints_rad[:, :4])
         return margins.block >= 0.0
 
@@ -214,7 +210,7 @@ class FreePaths:
             return False
         profile = np.zeros(8)  # how high a hand travels is no matter of touching
         if block_mm is None:
-            loaded = self._loaded[arm]
+            loaded = self._segment(arm, loaded=True)
             segment = replace(loaded, scene=loaded.scene._replace(profile=profile))
         else:
             segment = self._around_block(arm, block_mm, joints_rad[[0, -1], :4], profile)
@@ -226,6 +222,20 @@ class FreePaths:
         self.planned += 1
         return time_path(found.points, self.motion.degree, *self.limits[arm], STEP_S)
 
+    def _segment(self, arm: int, loaded: bool) -> Segment:
+        """A way of an arm, its hand empty or with the block, whose ends and lift-over are to be replaced; made when it is asked for."""
+        key = arm, loaded
+        if key not in self._segments:
+            planner, its = self.planner, self.planner.model.cell.arms[arm]
+            ahead, others = its.base.to_world([(its.r_min_mm + its.r_max_mm) / 2, 0.0]), planner.others_home_rad(arm)
+            made = (
+                planner.carrying(arm, ahead, ahead, others)
+                if loaded
+                else planner.reaching(arm, self.homes_rad[arm], ahead, others, leaving=True)
+            )
+            self._segments[key] = made[0]
+        return self._segments[key]
+
     def _found(self, segment: Segment, guesses: Iterator[Floats], wanted: int = 2) -> FoundPath:
         return find_path(segment, guesses, self.motion.control_points, self.motion.degree, self.motion.num_initial_guesses, wanted=wanted)
 
@@ -235,7 +245,7 @@ class FreePaths:
 
     def _around_block(self, arm: int, block_mm: Floats, ends: Floats, profile: Floats) -> Segment:
         """A way of the empty hand past a block that lies at a world position."""
-        empty = self._empty[arm]
+        empty = self._segment(arm, loaded=False)
         block = standing_block(self.planner.collision_models[arm], self.planner.model, self.planner.in_base(arm, block_mm))
         obstacles = np.concatenate([empty.scene.obstacles[: empty.scene.arm_rows], block])
         scene = empty.scene._replace(obstacles=obstacles, group=ball_around(obstacles), profile=profile)

@@ -64,6 +64,24 @@ class WorldState:
         """Carry out ``pieces`` from now on, in the place of what was under way; the first begins where its arm is."""
         self.program, self.clock_s = deque(segments), 0.0
 
+    def relaid(self, model: CellModel, homes_rad: Floats) -> WorldState:
+        """The same block among arms that stand as ``model`` has them, in the middle of a program's first piece if its arm has stayed.
+
+        An arm with the same name, robot and base keeps its posture, and what it holds; every other one is at its pose of ``homes_rad``
+        (num_arms, 5).
+        """
+        world = WorldState(model, homes_rad, self.pose)
+        known = {arm.name: (arm.base, arm.robot) for arm in self.model.cell.arms}
+        for index, arm in enumerate(model.cell.arms):
+            if known.get(arm.name) != (arm.base, arm.robot):
+                continue
+            before = self.model.cell.names.index(arm.name)
+            world.joints_rad[index], world.opened[index] = self.joints_rad[before], self.opened[before]
+            if before == self.arm:
+                world.program.append(self.program[0]._replace(arm=index))
+                world.clock_s, world.held, world._T_grip_block = self.clock_s, self.held, self._T_grip_block
+        return world
+
     def step(self, dt_s: float) -> tuple[float, str]:
         """Move for at most ``dt_s``, to the end of a piece at most.
 
