@@ -52,6 +52,7 @@ class LayoutPanel:
         self._generation = -1
         self._arm, self._disc, self._broken = NONE, NONE, False
         self._drawn: tuple[Any, ...] = ()
+        self._told: tuple[Any, ...] = ()
         self.note = ""
         """What people should know of the cell as it is, one line; empty if nothing."""
         self._add_controls()
@@ -65,6 +66,7 @@ class LayoutPanel:
         for handles, noted in ((self._arms, self._note_arm), (self._discs, self._note_disc)):
             for index, handle in enumerate(handles):
                 if (moved := handle.fetch()) is not None:
+                    self._told = ()
                     noted(index, moved.pose)
         said = None
         while self._edits:
@@ -81,6 +83,13 @@ class LayoutPanel:
             self._drawn = drawn
             self._draw()
         stopped = snapshot.state == "stopped"
+        told = id(self._config), self._arm, self._disc, stopped
+        if self._told != told:
+            self._told = told
+            self._tell(stopped)
+
+    def _tell(self, stopped: bool) -> None:
+        """Put handles where things are, and the lists to what there is."""
         for handle, arm in zip(self._arms, self._config.arms, strict=False):
             pose = np.array([arm.x_mm, arm.y_mm, math.radians(arm.facing_deg)])
             handle.show(None if stopped else pose, arrows=arm.name == self._arm)
@@ -89,6 +98,8 @@ class LayoutPanel:
             disc = self._config.obstacles[index] if there else None
             handle.show(None if disc is None else np.array([disc.x_mm, disc.y_mm, 0.0]), arrows=False)
         self._list_choices()
+        if any(handle.held is not None for handle in (*self._arms, *self._discs)):
+            self._told = ()  # what is held is not moved, and has to be when it is let go
 
     def _draw(self) -> None:
         working = self.cell.in_order
@@ -98,6 +109,7 @@ class LayoutPanel:
             self.scene.show_cell(self.cell.model, self._config.enabled, bool(self._dials.value))
         elif [arm.name for arm in self._config.arms] == list(self.scene.model.cell.names):
             self.scene.show_bases([SE2.facing_deg(arm.x_mm, arm.y_mm, arm.facing_deg) for arm in self._config.arms])
+        self._told = ()
         if self._generation != self.scene.generation:  # other nodes are to be dragged now
             for handle in self._arms:
                 handle.remove()
@@ -195,10 +207,12 @@ class LayoutPanel:
 
     def _choose_arm(self, event: viser.GuiEvent[Any]) -> None:
         if by_hand(event):
+            self._told = ()
             self._arm = str(self._arm_choice.value)
 
     def _choose_disc(self, event: viser.GuiEvent[Any]) -> None:
         if by_hand(event):
+            self._told = ()
             self._disc = str(self._disc_choice.value)
 
     def _resize(self, event: viser.GuiEvent[Any]) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from marl_handover.arrays import Floats
 from marl_handover.config import require_choice
 from marl_handover.control.interactive.cell import InteractiveCell, Snapshot
 from marl_handover.errors import HandoverError
@@ -63,6 +64,7 @@ class PlayPage:
         self._stopped, self._stops = False, cell.stops
         self._over_s, self._trouble, self._decision = 0.0, "", ""
         self._wanted, self._loading = "", threading.Lock()
+        self._reached: tuple[Any, bytes, bool] = (None, b"", True)
         self._add_controls(speed)
         self._layout = LayoutPanel(server, cell, self.scene, self.dragged)
 
@@ -180,13 +182,21 @@ class PlayPage:
         self.scene.show_block(snapshot.T_world_block)
         held = self._goal_handle.held
         if held is None:
-            held = snapshot.goal
-        self.scene.show_goal(held, bool(self.cell.in_order.reaches(held[:2]).any()))
+            self.scene.show_goal(snapshot.goal, self._within(snapshot.goal))
+        else:
+            self.scene.show_goal(held, self._within(held))
         lies = snapshot.T_world_block[2, 3] < _LYING_MM and snapshot.phase not in _HELD
         self._goal_handle.show(None if self._stopped else snapshot.goal)
         self._block_handle.show(snapshot.block if lies and not self._stopped else None)
         plan = snapshot.plan
         self.scene.show_plan([placement.pose for placement in plan], [placement.arm for placement in plan])
+
+    def _within(self, goal: Floats) -> bool:
+        """Whether an arm reaches the goal (3,); looked at anew where it, or the cell, is another one."""
+        cell, place = self.cell.in_order, goal.tobytes()
+        if self._reached[0] is not cell or self._reached[1] != place:
+            self._reached = cell, place, bool(cell.reaches(goal[:2]).any())
+        return self._reached[2]
 
     def _tell(self, snapshot: Snapshot) -> None:
         """Texts and buttons, where they have changed."""

@@ -388,7 +388,7 @@ def place_names(plan: Floats, goal: Floats | None) -> list[str | None]:
     return [*names, f"goal ({', '.join(at_goal)})" if at_goal else "goal"]
 
 
-def _step_back(far: float, client: viser.ClientHandle) -> None:
+async def _step_back(far: float, client: viser.ClientHandle) -> None:
     """On a screen that is higher than wide, a phone's, the panel is below: the eye is farther away, the cell higher in the picture."""
     camera = client.camera
     if camera.aspect < 1.0:
