@@ -15,13 +15,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bench"))
 from fault_injection import SIGNS, FaultInjector
 
 from marl_handover.cell import build_cell, cell_config
+from marl_handover.compose import from_yaml
 from marl_handover.config import MotionConfig
 from marl_handover.control.events import Event
 from marl_handover.control.session import GivenGoal
-from marl_handover.control.settings import twin_workcell
+from marl_handover.control.settings import WorkcellConfig, twin_workcell
 from marl_handover.control.twin import Twin
 from marl_handover.errors import UnknownChoice
-from marl_handover.hardware.settings import ARMS
+from marl_handover.files import resource_path
+from marl_handover.hardware.settings import ARMS, HardwareConfig
 from tests.canonical_arms import PARKED_DEG
 
 PHASES = [["approach", 0.0, 1.0], ["grasp", 1.0, 1.4], ["transfer", 1.4, 3.0], ["park", 3.0, 4.0]]
@@ -125,3 +127,29 @@ def test_a_jam_holds_both_grippers(mishaps, twin, goal):
     assert all(twin.electronics.servos(arm)[-1].jammed for arm in range(len(ARMS)))
     mishaps.finish()
     assert not any(twin.electronics.servos(arm)[-1].jammed for arm in range(len(ARMS)))
+
+
+def test_of_two_boards_one_fails_and_every_hand_is_jammed(goal):
+    """A cable comes out, or a supply sags, at one board, now at this one and now at that; hands jam by their own board's channel."""
+    built = build_cell(cell_config("triangle"))
+    twin = Twin(built, MotionConfig(), WorkcellConfig(from_yaml(HardwareConfig, resource_path("configs/hardware/triangle_twin.yaml"))))
+    mishaps, hit = FaultInjector(twin, SimpleNamespace(cell=built.cell), seed=1), []
+    for _ in range(8):
+        mishaps.arrange("serial_loss", 0.1, goal)
+        twin.clock.sleep_s(0.2)
+        now_s = twin.clock.now_s()
+        for device in twin.electronics.devices.values():
+            device.advance(now_s)
+        out = [name for name, device in twin.electronics.devices.items() if not device.plugged]
+        assert len(out) == 1
+        hit += out
+        mishaps.finish()
+    assert set(hit) == {"main", "second"}
+    mishaps.arrange("missed_grasp", 0.1, goal)
+    twin.clock.sleep_s(0.2)
+    twin.electronics.gripper_mm(twin.clock.now_s())
+    jammed = {
+        (name, number) for name, device in twin.electronics.devices.items() for number, servo in device.servos.items() if servo.jammed
+    }
+    assert jammed == {("main", 4), ("main", 20), ("second", 4)}
+    twin.close()
