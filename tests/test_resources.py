@@ -64,6 +64,21 @@ def test_the_wheel_asks_for_one_physics_engine_and_its_extras_for_the_other(whee
 
 
 @pytest.mark.slow
+def test_an_installed_wheel_has_the_rungs_of_the_ladder(wheel, tmp_path):
+    code = (
+        "import gymnasium, marl_handover\n"
+        "from marl_handover.task.ladder import rungs\n"
+        "for rung in rungs(): print(rung.path.parent, len(rung.fixed.optimum))\n"
+        "print(gymnasium.make('marl_handover/Ladder-2-Pair-v0').reset()[1]['optimum'])"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(wheel[1])}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    *files, optimum = done.stdout.splitlines()
+    assert files == [f"{wheel[1] / 'marl_handover/resources/configs/ladder'} 1000"] * 12
+    assert optimum == "3"
+
+
+@pytest.mark.slow
 def test_an_installed_wheel_finds_them(wheel, tmp_path):
     site = wheel[1]
     code = (

@@ -66,6 +66,8 @@ class SupervisorEnv(EnvBase):
         else:
             self.rules = rules or Rules(CellBatch(layouts, np.zeros(num_envs, np.int64)), task)
         self.problems = problems
+        # What the tensordict carries from an episode's start to its end.
+        self._kept = [key for key, source in (("layout", layouts), ("optimum", problems)) if source is not None]
         self.generator = torch.Generator(device=self.device)
         self.epsilon_range_rad = (self.rules.epsilon_rad, self.rules.epsilon_rad)
         self._make_specs()
@@ -86,9 +88,8 @@ class SupervisorEnv(EnvBase):
             "feasible": Binary(shape=(count, 1), dtype=torch.bool, device=device),
             "outcome": Bounded(0, max(Outcome), shape=(count, 1), dtype=torch.int64, device=device),
         }
-        for key, carried_on in (("layout", self.layouts), ("optimum", self.problems)):
-            if carried_on is not None:
-                problem[key] = Unbounded(shape=(count, 1), dtype=torch.int64, device=device)
+        for key in self._kept:
+            problem[key] = Unbounded(shape=(count, 1), dtype=torch.int64, device=device)
         self.observation_spec = Composite(problem, shape=self.batch_size, device=device)
         self.action_spec = Bounded(-1.0, 1.0, shape=(count, self.rules.action_size), device=device)
         self.reward_spec = Unbounded(shape=(count, 1), device=device)
@@ -197,7 +198,7 @@ class SupervisorEnv(EnvBase):
         stepped = advance(rules, pose, goal, previous, action, made, epsilon_rad=epsilon, noise=noise, final_noise=final_noise)
         result, terminated, truncated = stepped.result, stepped.result.terminated[:, None], stepped.truncated[:, None]
         observation = self.observe(result.pose, goal, result.previous_arm, epsilon, rules)
-        kept = {key: tensordict[key] for key in ("layout", "optimum") if key in self.observation_spec.keys()}  # noqa: SIM118  # no mapping
+        kept = {key: tensordict[key] for key in self._kept}
         return TensorDict(
             kept
             | {

@@ -14,6 +14,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 from marl_handover.cell import build_cell
 from marl_handover.config import CellConfig
 from marl_handover.errors import counted
+from marl_handover.policies.registry import PRETRAINED
 from marl_handover.report.figure_style import BLUE, FAINT, GREY, HATCHES, INK, OUTCOMES, PAPER, RED, ruled, series_marker, series_style
 from marl_handover.report.plan import workspace_figure
 from marl_handover.report.table import Axes
@@ -110,7 +111,7 @@ def endings_figure(results: Tree, spec: Tree) -> Figure | None:
 def kind_of(row: Tree) -> str:
     """What a row is, of :data:`KINDS`."""
     if row["settings"] is None:
-        return "not learned"
+        return "continuous" if row.get("policy") in PRETRAINED else "not learned"
     return "discretised" if row["settings"]["algorithm.name"] == "dqn" else "continuous"
 
 
