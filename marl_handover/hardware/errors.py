@@ -168,7 +168,7 @@ class HalfHeld(DeviceError):
     def __init__(self) -> None:
         super().__init__(
             "the boards hold some servos, and have forgotten others: those would jump at full speed while the rest is in their way. "
-            "Let all go limp, put both arms into the parked pose, and arm again"
+            "Let all go limp, put the arms into the parked pose, and arm again"
         )
 
 

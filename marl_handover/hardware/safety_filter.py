@@ -1,10 +1,10 @@
 """The safety filter: every command passes it on its way to the wire, and every refusal says what it found and what is allowed.
 
 It stands below planning and trusts none of it. It models where the arms have been sent, by time, and judges each command from there:
-numbers, joint limits, pulses, age, step, speed, and the room swept on the way: table, the arm itself, the other arm.
+numbers, joint limits, pulses, age, step, speed, and the room swept on the way: table, the arm itself, the other arms.
 
 What is promised of that room: nowhere on the way of a command that passed, between samples too, is an arm nearer to the table, to itself
-or to the other arm than ``table_clearance_mm``, ``self_clearance_mm`` and ``arm_clearance_mm``, less 0.1 mm. A hand that is closed is
+or to another arm than ``table_clearance_mm``, ``self_clearance_mm`` and ``arm_clearance_mm``, less 0.1 mm. A hand that is closed is
 taken to hold the block, since nothing says that it is empty. The block and its pin keep the same distances, but for the table, on which
 the block stands when it is taken and set down: its lowest point, in whatever way it is turned about the pin, is nowhere lower than
 ``block_dip_mm`` under the table, less 0.1 mm. Aims that take out the backlash of servos are that much below what is meant.
