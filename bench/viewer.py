@@ -1,11 +1,13 @@
 """The browser page in numbers: how soon a drag is followed, how many updates every viewer gets, how much memory it takes in the long run.
 
 python bench/viewer.py drags=300 viewers=4 seconds=20 steps=10000 minutes=10 policy=exact results=bench/results
+python bench/viewer.py bases=200 cell=ring6 policy=exact
 python bench/viewer.py crowd=1500 crowd_seconds=120
 
-The second line measures something else: one viewer of each page, while so many sockets connect, read nothing, and connect again some
-seconds after they are let go. The viewers are programs that speak viser's protocol, in this process; the page is served by another one,
-``marl-handover view``.
+The second line drags bases of arms, to and fro by some mm, while the arms play: how soon a viewer sees the spaces that are shared then, the
+fewest transfers, and the first sample of the motion that is planned anew. The third line measures something else: one viewer of each page,
+while so many sockets connect, read nothing, and connect again some seconds after they are let go. The viewers are programs that speak
+viser's protocol, in this process; the page is served by another one, ``marl-handover view``.
 """
 
 from __future__ import annotations
@@ -38,13 +40,15 @@ from viewer_client import Client
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from marl_handover import cli
-from marl_handover.cell import cell_config, load_cell
+from marl_handover.cell import Cell, cell_config, load_cell
 from marl_handover.control.telemetry_reader import FORMAT, STATE_FILE, VERSION
 from marl_handover.files import write_whole
 from marl_handover.viewer.words import flat
 
 DEFAULTS = {
     "drags": 300,
+    "bases": 0,
+    "cell": "ring6",
     "viewers": 4,
     "seconds": 20,
     "steps": 10000,
@@ -55,7 +59,9 @@ DEFAULTS = {
     "crowd": 0,
     "crowd_seconds": 120,
 }
-LIMIT_MS, LIMIT_HZ = 100.0, 20.0
+LIMIT_MS, LIMIT_HZ, LIMIT_BASE_MS = 100.0, 20.0, 250.0
+BASE_MM, BASE_RAD = 12.0, 0.1
+"""How far a base is dragged from where it stands."""
 SCRUB_HZ = 30.0
 AGAIN_S = 5.0
 UPDATE_S = 1 / 60
@@ -109,6 +115,55 @@ def drags(client: Client, count: int, seed: int) -> list[float]:
         time.sleep(random.uniform(0.05, 1.0))
         times.append(drag(client, pose))
     return times
+
+
+def base_drags(client: Client, cell: Cell, count: int, seed: int) -> list[float]:
+    """Latencies in ms of drags of bases at random moments, most of them in mid-motion.
+
+    The page shows arm, spaces, optimum and the first sample of the new motion in one piece, so that the arm's base tells of them all.
+    """
+    random, times = np.random.default_rng(seed), []
+    for _ in range(count):
+        time.sleep(random.uniform(0.05, 1.0))
+        arm = int(random.integers(cell.num_arms))
+        base = cell.bases[arm]
+        offset = random.uniform(-1, 1, 3) * [BASE_MM, BASE_MM, BASE_RAD]
+        wxyz, position = flat([base.x_mm, base.y_mm, base.facing_rad] + offset, 5.0)
+        at = np.round(1e3 * position[:2], 1)
+        begun = time.perf_counter()
+        client.drag(f"/base_0_{arm}", position.tolist(), wxyz.tolist())
+        client.drag(f"/base_0_{arm}", position.tolist(), wxyz.tolist(), "end")
+
+        def there(arm: int = arm, at: np.ndarray = at) -> bool:
+            return bool(np.abs(1e3 * np.asarray(client.nodes[f"/arm_{arm}"]["position"][:2]) - at).max() < 1e-3)
+
+        times.append(1e3 * (client.wait(there, 30) - begun))
+    return times
+
+
+def bases(settings: dict[str, Any]) -> None:
+    """Drag bases, and tell how soon that is followed."""
+    cell = load_cell(settings["cell"])
+    with contextlib.ExitStack() as stack:
+        arguments = f"cell={settings['cell']}", f"policy={settings['policy']}", f"seed={settings['seed']}"
+        address, pid = stack.enter_context(page(*arguments))
+        (client,) = stack.enter_context(watched(address, 1))
+        base_drags(client, cell, 5, settings["seed"] + 1)
+        before_s, begun = cpu_s(pid), time.perf_counter()
+        times = base_drags(client, cell, settings["bases"], settings["seed"])
+        share = (cpu_s(pid) - before_s) / (time.perf_counter() - begun)
+    rows = [
+        [f"base to spaces, optimum and motion, {cell.num_arms} arms, p{q}", f"{np.percentile(times, q):.0f} ms", f"{LIMIT_BASE_MS:.0f} ms"]
+        for q in (50, 95, 99)
+    ]
+    rows.append(["of a core, for the page", f"{share:.2f}", ""])
+    print(table(["what", "measured", "limit"], rows))
+
+
+def cpu_s(pid: int) -> float:
+    """Processor time of a process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def updates(clients: list[Client], seconds: float, meanwhile: Callable[[float], None] = time.sleep) -> list[float]:
@@ -277,6 +332,9 @@ def crowds(settings: dict[str, Any]) -> dict[str, Any]:
 
 def main(arguments: list[str]) -> None:
     settings = parse(arguments, DEFAULTS)
+    if settings["bases"]:
+        bases(settings)
+        return
     if settings["crowd"]:
         crowds(settings)
         return

@@ -66,12 +66,12 @@ def press(viewer, group, button):
     viewer.set(group, button)
 
 
-def test_a_dragged_base_takes_its_arm_and_what_it_shares_along(viewer, cell):
-    before = viewer.nodes["/shared"]["vertices"]
+def test_a_dragged_base_takes_its_arm_and_what_it_shares_along(server, viewer, cell):
+    before = server.scene.get_handle_by_name("/shared").vertices
     pose = np.array([-60.0, 360.0, np.radians(-80.0)])
     carry(viewer, "/base_0_0", pose)
     viewer.wait(lambda: np.allclose(at(viewer, "/arm_0"), [*pose[:2], 0.0], atol=0.1), SEEN_S)
-    viewer.wait(lambda: viewer.nodes["/shared"]["vertices"] != before, SEEN_S)
+    viewer.wait(lambda: not np.array_equal(server.scene.get_handle_by_name("/shared").vertices, before), SEEN_S)
     assert cell.layout.arms[0].x_mm == pytest.approx(-60.0)
     assert cell.layout.arms[0].facing_deg == pytest.approx(-80.0)
     viewer.wait(lambda: viewer.panel[viewer.input("arm")]["value"] == "one", SEEN_S)
