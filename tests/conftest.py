@@ -54,6 +54,25 @@ def _registry_of_tests(tmp_path_factory):
 
 
 @pytest.fixture
+def no_new_plugins(monkeypatch):
+    """What a plug-in registers meanwhile is forgotten afterwards."""
+    from marl_handover import plugins
+    from marl_handover.config import BACKENDS, ENGINES, LAYOUTS
+    from marl_handover.learning.algorithm import LEARNERS
+    from marl_handover.learning.settings import ALGORITHMS
+    from marl_handover.policies import POLICIES
+
+    monkeypatch.delenv(plugins.VARIABLE, raising=False)
+    monkeypatch.setattr(plugins, "_loaded", set())
+    tables = [LEARNERS, *(registry._entries for registry in (ALGORITHMS, BACKENDS, ENGINES, LAYOUTS, POLICIES))]
+    before = [dict(table) for table in tables]
+    yield
+    for table, entries in zip(tables, before, strict=True):
+        table.clear()
+        table.update(entries)
+
+
+@pytest.fixture
 def empty_session_registry(tmp_path, monkeypatch):
     """No session of another test in this process is registered: what a page stops is then the session that the test made up."""
     from marl_handover.hardware import session_registry

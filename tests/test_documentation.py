@@ -73,13 +73,13 @@ def test_every_command_line_is_one(page, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", list(wanted(slow=False)))
-def test_blocks_run(page, tmp_path, monkeypatch):
+def test_blocks_run(page, tmp_path, monkeypatch, no_new_plugins):
     run_page(page, tmp_path, monkeypatch, slow=False)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", list(wanted(slow=True)))
-def test_slow_blocks_run(page, tmp_path, monkeypatch):
+def test_slow_blocks_run(page, tmp_path, monkeypatch, no_new_plugins):
     run_page(page, tmp_path, monkeypatch, slow=True)
 
 

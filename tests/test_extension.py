@@ -12,11 +12,8 @@ import pytest
 
 from marl_handover import plugins
 from marl_handover.cli import main
-from marl_handover.config import BACKENDS, ENGINES, LAYOUTS
 from marl_handover.experiments.executor import fan_out
-from marl_handover.learning.algorithm import LEARNERS
 from marl_handover.learning.settings import ALGORITHMS
-from marl_handover.policies import POLICIES
 
 ARM = """
 arms:
@@ -113,21 +110,15 @@ SHORT = [
 
 
 @pytest.fixture
-def write(tmp_path, monkeypatch):
+def write(tmp_path, no_new_plugins):
     """``write("name.py", text)``: the path of a file in a folder of its own; afterwards nobody knows what it registered."""
-    monkeypatch.delenv(plugins.VARIABLE, raising=False)
-    monkeypatch.setattr(plugins, "_loaded", set())
 
     def make(name, text):
         path = tmp_path / name
         path.write_text(text)
         return str(path)
 
-    yield make
-    added = {"bolder": (ALGORITHMS._entries, LEARNERS), "coarse": (BACKENDS._entries,), "hesitant": (POLICIES._entries,)}
-    for name, tables in (added | {"difference": (LAYOUTS._entries,), "told": (ENGINES._entries,)}).items():
-        for table in tables:
-            table.pop(name, None)
+    return make
 
 
 def evaluated(tmp_path, *arguments):
