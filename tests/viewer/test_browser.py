@@ -159,6 +159,3 @@ def test_on_a_phone_the_cell_is_above_the_panel(serving, opened, tmp_path):
         page.wait_for_timeout(LOADED_MS)
         picture = Image.open(io.BytesIO(page.screenshot(path=tmp_path / "phone.png"))).crop((0, 140, 390, 340))
         assert len(np.unique(np.asarray(picture.convert("RGB"))[::2, ::2].reshape(-1, 3) // 16, axis=0)) > 60
-        for text in ("north", "west", "east"):
-            box = page.get_by_text(f"arm {text}", exact=True).bounding_box()
-            assert 0 < box["x"] < 390
