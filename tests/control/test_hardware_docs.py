@@ -52,3 +52,26 @@ def test_what_the_twin_came_to_is_what_is_stored():
     assert "5,001 transfers in one process, 1,654 problems one after another, solved every one" in " ".join(TEXT.split())
     for text in (TEXT, (root / "README.md").read_text(encoding="utf-8")):
         assert "200 of 200 in the end" in " ".join(text.split())
+
+
+def test_what_the_twin_of_three_arms_came_to_is_what_is_stored():
+    stored = Path(__file__).resolve().parents[2] / "bench/results/2026-11-30/twin_triangle.json"
+    result = json.loads(stored.read_text(encoding="utf-8"))
+    drills, settings = result["drills"], result["settings"]
+    assert (settings["cell"], settings["hardware"], settings["policy"], settings["robots"]) == ("triangle", "triangle_twin", "exact", 2)
+    assert (drills["count"], drills["happened"], drills["reached"]) == (50, 50, 1.0)
+    assert (drills["violations"], drills["hangs"], drills["exceptions"]) == ({}, 0, [])
+    assert "50 of 50 random problems were solved in the end by `exact`" in " ".join(TEXT.split())
+
+
+def test_what_many_arms_came_to_in_physics_is_what_is_stored():
+    root = Path(__file__).resolve().parents[2]
+    rows = json.loads((root / "bench/results/2026-11-30/many_arms_physics.json").read_text(encoding="utf-8"))["rows"]
+    assert all(row["report"]["success_rate"] == row["report"]["success_in_the_end"] == 1.0 for row in rows)
+    played = {tuple(word.partition("=")[2] for word in row["command"].split()[1:]) for row in rows}
+    for engine in ("bullet", "mujoco"):
+        for cell in ("triangle", "line4"):
+            assert {(policy, cell, engine, "100", "0") for policy in ("exact", "pretrained_any")} <= played
+        assert ("exact", "mixed.yaml", engine, "50", "0") in played
+    text = (root / "docs/howto/cells.md").read_text(encoding="utf-8")
+    assert "every one of 100 random problems of `triangle` and of `line4`, in either engine" in " ".join(text.split())
