@@ -6,15 +6,18 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from marl_handover import policies
+from marl_handover.cell import cell_config, load_cell
+from marl_handover.cli import main
 from marl_handover.compose import compose
 from marl_handover.config import TaskConfig
-from marl_handover.errors import CorruptFile, MissingFile, UnknownChoice
+from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, UnknownChoice
 from marl_handover.learning.checkpoint import policy_arrays, run_arrays, save_policy
 from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.learning.trainer import Trainer
@@ -205,3 +208,25 @@ def test_a_file_that_does_not_say_what_it_is_is_corrupt(tmp_path, file, key):
     about = {name: value for name, value in json.loads(str(arrays["about"])).items() if name != key}
     np.savez(path, **{**arrays, "about": np.array(json.dumps(about))})
     assert_corrupt(path)
+
+
+@pytest.mark.parametrize("kept", [("chart", "cell"), ("cell",), ("chart",), ()])
+@pytest.mark.parametrize(("trained", "other"), [("paper", "angle"), ("angle", "paper")])
+def test_places_told_in_another_chart_are_refused(tmp_path, file, trained, other, kept):
+    """Whether the file says it by itself, by its cell, or, as older ones, not at all: then it is the paper's."""
+    path, arrays = tmp_path / "policy.npz", policies.read_policy(file)
+    about = json.loads(str(arrays["about"]))
+    assert about.pop("chart") == "paper"
+    about["cell"]["chart"] = trained if "cell" in kept else None
+    about |= {"chart": trained} if "chart" in kept else {}
+    np.savez(path, **{**arrays, "about": np.array(json.dumps(about))})
+    trained, other = (trained, other) if kept else ("paper", "angle")
+    cells = {chart: load_cell(replace(cell_config("paper"), chart=chart)) for chart in ("paper", "angle")}
+    assert policies.load(str(path), cell=cells[trained]).rules.cell.chart_name == trained
+    with pytest.raises(InvalidSetting, match=f"cell.chart = '{other}': must be '{trained}'"):
+        policies.load(str(path), cell=cells[other])
+
+
+def test_the_pairs_own_policy_does_not_act_on_the_angle_chart(capsys):
+    assert main(["evaluate", "policy=pretrained_b", "cell.chart=angle", "episodes=2"]) == 2
+    assert "cell.chart = 'angle': must be 'paper'" in capsys.readouterr().err

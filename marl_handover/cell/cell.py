@@ -166,6 +166,11 @@ class Cell(Sectors):
             raise UnconnectedArms([[name] for name in self.names], bool(self.keep_out))
         return self.graph.edges[(0, 1)]
 
+    @property
+    def chart_name(self) -> str:
+        """As the base class; a pair that has the paper's chart says so."""
+        return "paper" if self.num_arms == 2 and isinstance(self.chart, PaperChart) else "angle"
+
     def paper_chart(self, what: str) -> PaperChart:
         """The chart of a pair, which ``what`` needs to be the paper's. Raises :class:`InvalidSetting` if it is another one."""
         if not isinstance(self.chart, PaperChart):

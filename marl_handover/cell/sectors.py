@@ -23,6 +23,11 @@ class Sectors(ABC):
         """Number of arms."""
 
     @property
+    def chart_name(self) -> str:
+        """``paper`` or ``angle``: the numbers in which actions tell places."""
+        return "angle"
+
+    @property
     @abstractmethod
     def keep_out(self) -> Sized:
         """Where nothing may be put; empty if nowhere."""

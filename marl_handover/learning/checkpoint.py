@@ -118,6 +118,7 @@ def policy_arrays(algorithm: Algorithm, config: TrainConfig, origin: str) -> Arr
         "kind": algorithm.kind,
         "layout": config.algorithm.layout,
         "cell": asdict(config.cell),
+        "chart": algorithm.rules.cell.chart_name,
         "task": asdict(config.task),
         "variant": config.variant,
         "layers": len(networks[0]),

@@ -255,14 +255,27 @@ def _rules(cell: Cell, task: TaskConfig, motion: MotionConfig | None, about: Map
 
     Raises:
         TwoArmsOnly: the policy of a file is to act in a cell of other than two arms.
+        InvalidSetting: it tells places in another chart than the cell's.
     """
     if about and about["kind"] != "graph":
         cell.require_pair("a trained policy", "policy=pretrained_any, exact and greedy take any cell")
+        trained = _trained_chart(about)
+        if trained not in ("", cell.chart_name):
+            raise InvalidSetting("cell.chart", cell.chart_name, f"{trained!r} for this policy, which tells places in that chart")
     if about and about["variant"] == "centralised":
         from marl_handover.envs.centralised import CentralisedRules
 
         return CentralisedRules(cell, task, CentralisedConfig(**about["centralised"]), motion)
     return Rules(cell, task, motion_cost(cell, task, motion))
+
+
+def _trained_chart(about: Mapping[str, Any]) -> str:
+    """The chart that a policy file was trained with; empty where an old one does not say, and a grid of places suits any."""
+    if about["kind"] == "discrete":
+        return ""
+    cell = about["cell"]
+    mirrored = not cell.get("arms") and not cell.get("obstacles")  # the pair as older files know it has the paper's
+    return str(about.get("chart") or cell.get("chart") or ("paper" if mirrored else ""))
 
 
 def _arrays(name: str) -> Arrays:
