@@ -44,7 +44,7 @@ LONG_WORK = (
     "marl_handover.commands.calibrate._camera",  # after the twin was built
     "marl_handover.commands.calibrate._servos",
     "marl_handover.commands.calibrate._grippers",
-    "marl_handover.hardware.emulator.pty.PtyEmulator.turn",  # after the port was made
+    "marl_handover.hardware.emulator.pty.turn",  # after the port was made
     "marl_handover.motion.path_length_table.build_table",  # of rewards for short paths: before the first path
     "marl_handover.viewer.server.open_server",  # before the server listens
     "marl_handover.report.figure_style.save_figure",  # after the figure was made

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -38,9 +38,11 @@ from marl_handover.config import (
 from marl_handover.errors import ChecksumMismatch, InvalidSetting
 from marl_handover.files import read_bounded, resource_path
 from marl_handover.parsing import JSON_BYTES, parse_object, read_yaml
-from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.problems import ProblemSource, sample_problems
 from marl_handover.task.rules import Rules
+
+if TYPE_CHECKING:
+    from marl_handover.task.planner import ExactPlanner
 
 FOLDER, RUNGS = "configs/ladder", "rungs.yaml"
 EVALUATION, TRAINING = SPLITS = ("evaluation", "training")
@@ -209,7 +211,7 @@ class RungSource(ProblemSource):
         self.optimum = int(optimum)
         if given:
             start, goal = given.get("state", start), given.get("goal", goal)
-            self.optimum = int(ExactPlanner(Rules(self.cell, self.rung.task())).plan(start, goal).transfers)
+            self.optimum = int(_planner(Rules(self.cell, self.rung.task())).plan(start, goal).transfers)
         return np.array(start), np.array(goal)
 
     def _numbered(self, number: Any) -> int:
@@ -224,11 +226,18 @@ def _joined(parts: Sequence[RungProblems]) -> RungProblems:
     return RungProblems(np.concatenate(start), np.concatenate(goal), np.concatenate(optimum))
 
 
+def _planner(rules: Rules) -> ExactPlanner:
+    """The planner of rules. It is compiled: who only reads problems does without."""
+    from marl_handover.task.planner import ExactPlanner
+
+    return ExactPlanner(rules)
+
+
 def _clear_problems(rules: Rules, generator: torch.Generator) -> RungProblems:
     """Of some random problems those whose optimum is not on an edge, on the grid of poses."""
     step = np.array([STEP_MM, STEP_MM, STEP_RAD])
     start, goal = (np.trunc(poses.numpy() / step) * step for poses in sample_problems(rules.cell, _BLOCK, generator))
-    planner, epsilon_rad = ExactPlanner(rules), rules.epsilon_rad
+    planner, epsilon_rad = _planner(rules), rules.epsilon_rad
     optimum, *beside = (
         np.asarray(planner.plan(start, goal, epsilon_rad + change).transfers) for change in np.radians([0.0, -CLEAR_DEG, CLEAR_DEG])
     )

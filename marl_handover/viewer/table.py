@@ -72,7 +72,7 @@ class TableNodes:
         self._table.dimensions = tuple((metres([2 * half[0], 2 * half[1], 15.0])).tolist())
         for index, (arm, label, outline) in enumerate(zip(arms, labels, outlines, strict=True)):
             self._line(f"/reach_{index}", _polyline(outline, _OUTLINE_MM), arm_colour(index) if allowed else ALERT, 1.6)
-            at = metres([*(arm.base.position_mm - _NAME_MM * np.array(arm.base.facing)), 0.0])
+            at = metres([*arm.base.around(-_NAME_MM, 0.0), 0.0])
             if index == len(self._names):
                 self._names.append(self.server.scene.add_label(f"/name_{index}", "", position=at, anchor="center-center"))
             name = self._names[index]
