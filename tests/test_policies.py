@@ -18,6 +18,7 @@ from marl_handover.cli import main
 from marl_handover.compose import compose
 from marl_handover.config import TaskConfig
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, UnknownChoice
+from marl_handover.files import package_path
 from marl_handover.learning.checkpoint import policy_arrays, run_arrays, save_policy
 from marl_handover.learning.settings import ALGORITHMS, TrainConfig
 from marl_handover.learning.trainer import Trainer
@@ -230,3 +231,12 @@ def test_places_told_in_another_chart_are_refused(tmp_path, file, trained, other
 def test_the_pairs_own_policy_does_not_act_on_the_angle_chart(capsys):
     assert main(["evaluate", "policy=pretrained_b", "cell.chart=angle", "episodes=2"]) == 2
     assert "cell.chart = 'angle': must be 'paper'" in capsys.readouterr().err
+
+
+def test_a_run_is_loaded_in_a_cell_with_a_disc_on_the_middle_of_a_ring():
+    """Where no arm can have the object a policy has no answer; that is no fault of its file."""
+    cell = load_cell(cell_config("scattered8"))
+    middles = np.array([arm.at((arm.r_min_mm + arm.r_max_mm) / 2, sum(arm.yaw_rad) / 2) for arm in cell.arms])
+    assert not cell.reaches(middles).any(-1).all()
+    path = str(package_path("pretrained/any.npz"))
+    assert policies.load(path, cell=cell).rules.cell is cell
