@@ -6,10 +6,10 @@ import heapq
 import math
 import random
 import re
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -102,77 +102,38 @@ _ANSWER_S, _REPLY_DELAY_S, _BYTE_GAP_S = 100e-6, 1e-6 * 600, 1e-6 * 70
 _POWER = ("brownout", "silent")
 
 
-class SerialDevice(Protocol):
-    """What can be behind a serial port. All times are in s on one clock, and never go back."""
+class SerialDevice(ABC):
+    """What is behind a serial port: bytes take their time on the line, and faults begin and end.
 
-    host_baud: int
-    """What the computer has set its port to."""
+    All times are in s on one clock, and never go back; nothing happens but by :meth:`advance`.
 
-    baud: int
-    unplugged: int
-    """How many times the cable came out; a port that was open then is dead, even if the cable is back."""
+    Args:
+        baud: what it is set to.
+        seed: of what faults change at random.
+    """
 
-    lines: deque[tuple[float, bytes]]
-    """The last lines, or packets, that came in, and when each ended."""
+    def __init__(self, baud: int, seed: int) -> None:
+        self.baud = self.host_baud = baud
+        self.lines: deque[tuple[float, bytes]] = deque(maxlen=1000)
+        """The last lines, or packets, that came in, and when each ended."""
+        self.unplugged = 0
+        """How many times the cable came out; a port that was open then is dead, even if the cable is back."""
+        self._random = random.Random(seed)
+        self._incoming: deque[tuple[float, bytes]] = deque()
+        self._outgoing: deque[tuple[float, int]] = deque()
+        self._heard_until_s, self._now_s = 0.0, 0.0
+        self._faults: list[Fault] = []
+        self._edges: list[tuple[float, int, bool, Fault]] = []
 
     @property
+    @abstractmethod
     def title(self) -> str:
         """What it is, in a few words."""
 
     @property
     def plugged(self) -> bool:
         """Whether the port is there, at the time the device was last advanced to."""
-
-    def write(self, data: bytes, t_s: float) -> None:
-        """Bytes from the computer."""
-
-    def read(self, t_s: float, size: int | None = None) -> bytes:
-        """Up to ``size`` bytes that have come back by ``t_s``; all of them without ``size``."""
-
-    def waiting(self, t_s: float) -> int:
-        """Number of bytes that have come back and were not read."""
-
-    def next_event_s(self) -> float | None:
-        """When something may happen next that the computer could notice; None if nothing is under way."""
-
-    def sending_until_s(self) -> float:
-        """When the last byte written will have arrived."""
-
-    def forget_input(self) -> None:
-        """Throw away what has come back."""
-
-    def advance(self, t_s: float) -> None:
-        """Let everything happen up to ``t_s``, in order."""
-
-
-class EmulatedDevice:
-    """What is plugged into one port. All times are in s on one clock, and never go back; nothing happens but by :meth:`advance`.
-
-    Args:
-        board: the controller.
-        servos: by channel.
-        baud: what the board's button or jumpers are set to.
-        boot_s: how long the board takes from power to its first ear for bytes.
-        seed: of what faults change at random.
-    """
-
-    def __init__(
-        self, board: EmulatedBoard, servos: Mapping[int, Servo] | None = None, *, baud: int = 115200, boot_s: float = 0.2, seed: int = 0
-    ) -> None:
-        self.board, self.servos = board, dict(servos or {})
-        self.baud, self.boot_s = baud, boot_s
-        self.host_baud = self.baud
-        self.lines: deque[tuple[float, bytes]] = deque(maxlen=1000)
-        """The last lines that the board was sent, and when each ended."""
-        self.unplugged = 0
-        """How many times the cable came out; a port that was open then is dead, even if the cable is back."""
-        self._random = random.Random(seed)
-        self._incoming: deque[tuple[float, bytes]] = deque()
-        self._outgoing: deque[tuple[float, int]] = deque()
-        self._heard_until_s, self._said_until_s, self._now_s = 0.0, 0.0, 0.0
-        self._powered, self._fragment = True, b""
-        self._faults: list[Fault] = []
-        self._edges: list[tuple[float, int, bool, Fault]] = []
+        return not self._active("unplug")
 
     def add_faults(self, faults: Iterable[Fault]) -> None:
         """Let things go wrong, at the times the faults say; a start in the past is now."""
@@ -180,32 +141,14 @@ class EmulatedDevice:
             self._faults.append(fault)
             heapq.heappush(self._edges, (fault.start_s, len(self._faults), True, fault))
             if fault.duration_s < float("inf"):
-                end_s = fault.end_s + (self.boot_s if fault.kind in _POWER else 0.0)
-                heapq.heappush(self._edges, (end_s, len(self._faults), False, fault))
+                heapq.heappush(self._edges, (self._over_s(fault), len(self._faults), False, fault))
         self.advance(self._now_s)
-
-    @property
-    def title(self) -> str:
-        """Its firmware's own name."""
-        return self.board.firmware.text
-
-    @property
-    def plugged(self) -> bool:
-        """Whether the port is there, at the time the device was last advanced to."""
-        return not self._active("unplug")
-
-    @property
-    def powered(self) -> bool:
-        """Whether the controller runs."""
-        return self._powered
 
     def write(self, data: bytes, t_s: float) -> None:
         """Bytes from the computer; they arrive one after the other at the line's pace."""
         self.advance(t_s)
-        if self.host_baud != self.baud:
-            data = self._random.randbytes(len(data))
         begin_s, per_byte_s, count = max(t_s, self._heard_until_s), BITS_PER_BYTE / self.host_baud, 0
-        for piece in re.split(rb"(?<=\r)", data):
+        for piece in self._pieces(data):
             if piece:
                 count += len(piece)
                 self._incoming.append((begin_s + count * per_byte_s, piece))
@@ -241,35 +184,96 @@ class EmulatedDevice:
     def advance(self, t_s: float) -> None:
         """Let everything happen up to ``t_s``, in order."""
         while True:
-            line_s = self._incoming[0][0] if self._incoming else float("inf")
+            piece_s = self._incoming[0][0] if self._incoming else float("inf")
             edge_s = self._edges[0][0] if self._edges else float("inf")
-            if min(line_s, edge_s) > t_s:
+            if min(piece_s, edge_s) > t_s:
                 break
-            self._follow(min(line_s, edge_s))
-            if edge_s <= line_s:
+            self._follow(min(piece_s, edge_s))
+            if edge_s <= piece_s:
                 _, _, begins, fault = heapq.heappop(self._edges)
+                if not begins:
+                    self._faults.remove(fault)
                 self._edge(fault, begins)
             else:
                 self._hear(*self._incoming.popleft())
         self._follow(t_s)
+
+    def _active(self, kind: str) -> Fault | None:
+        return next((fault for fault in self._faults if fault.kind == kind and fault.active(self._now_s)), None)
+
+    def _over_s(self, fault: Fault) -> float:
+        """When a fault has no more effect."""
+        return fault.end_s
+
+    def _pull_out(self, begins: bool) -> None:
+        """The cable comes out, or is put back: what was on the line is gone."""
+        self.unplugged += begins
+        self._incoming.clear()
+        self._outgoing.clear()
+        self._heard_until_s = self._now_s
+
+    @abstractmethod
+    def _pieces(self, data: bytes) -> Iterable[bytes]:
+        """What is heard of bytes, in the pieces in which it is looked at."""
+
+    @abstractmethod
+    def _edge(self, fault: Fault, begins: bool) -> None:
+        """A fault begins or ends."""
+
+    @abstractmethod
+    def _hear(self, t_s: float, piece: bytes) -> None:
+        """Bytes have arrived."""
+
+    @abstractmethod
+    def _follow(self, t_s: float) -> None:
+        """Let servos move up to a time."""
+
+
+class EmulatedDevice(SerialDevice):
+    """A controller with its servos.
+
+    Args:
+        board: the controller.
+        servos: by channel.
+        baud: what the board's button or jumpers are set to.
+        boot_s: how long the board takes from power to its first ear for bytes.
+        seed: of what faults change at random.
+    """
+
+    def __init__(
+        self, board: EmulatedBoard, servos: Mapping[int, Servo] | None = None, *, baud: int = 115200, boot_s: float = 0.2, seed: int = 0
+    ) -> None:
+        super().__init__(baud, seed)
+        self.board, self.servos, self.boot_s = board, dict(servos or {}), boot_s
+        self._said_until_s = 0.0
+        self._powered, self._fragment = True, b""
+
+    @property
+    def title(self) -> str:
+        """Its firmware's own name."""
+        return self.board.firmware.text
+
+    @property
+    def powered(self) -> bool:
+        """Whether the controller runs."""
+        return self._powered
+
+    def _over_s(self, fault: Fault) -> float:
+        return fault.end_s + (self.boot_s if fault.kind in _POWER else 0.0)
+
+    def _pieces(self, data: bytes) -> Iterable[bytes]:
+        return re.split(rb"(?<=\r)", data if self.host_baud == self.baud else self._random.randbytes(len(data)))
 
     def outputs_us(self, t_s: float) -> list[float]:
         """What each channel puts out; 0: no pulse."""
         self.advance(t_s)
         return self.board.outputs_us(t_s) if self._powered else [0.0] * len(self.board.channels)
 
-    def _active(self, kind: str) -> Fault | None:
-        return next((fault for fault in self._faults if fault.kind == kind and fault.active(self._now_s)), None)
-
     def _edge(self, fault: Fault, begins: bool) -> None:
         """A fault begins or ends."""
-        if not begins:
-            self._faults.remove(fault)
         if fault.kind == "unplug":
-            self.unplugged += begins
-            self._incoming.clear()
-            self._outgoing.clear()
-            self._heard_until_s = self._said_until_s = self._now_s
+            self._pull_out(begins)
+            self._said_until_s = self._now_s
         elif fault.kind in _POWER:
             # Off while any such fault is on: they may overlap.
             self._powered = not any(other.kind in _POWER and other.start_s <= self._now_s for other in self._faults)

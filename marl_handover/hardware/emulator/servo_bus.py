@@ -6,14 +6,12 @@ of their bytes, as an open-drain line does.
 
 from __future__ import annotations
 
-import heapq
-import math
 import random
 from collections import deque
 from collections.abc import Iterable
 
 from marl_handover.config import require_choice
-from marl_handover.hardware.emulator.device import BITS_PER_BYTE, Fault, parse_faults
+from marl_handover.hardware.emulator.device import BITS_PER_BYTE, Fault, SerialDevice, parse_faults
 from marl_handover.hardware.emulator.sts3215 import Sts3215, Sts3215Truth
 from marl_handover.hardware.feetech import (
     ACTION,
@@ -23,12 +21,13 @@ from marl_handover.hardware.feetech import (
     PING,
     READ,
     REG_WRITE,
+    REPLY_BYTES,
     RESET,
     SYNC_READ,
     SYNC_WRITE,
     WRITE,
-    checksum,
     find_packets,
+    packet,
 )
 from marl_handover.hardware.settings import SERVO_BAUDS, HardwareConfig
 
@@ -56,8 +55,8 @@ def parse_servo_faults(text: str) -> list[Fault]:
 THINKING_S = 30e-6
 
 
-class EmulatedBus:
-    """Servos on one wire behind one port. Times are in s on one clock; nothing happens but by :meth:`advance`.
+class EmulatedBus(SerialDevice):
+    """Servos on one wire behind one port.
 
     Args:
         servos: in the order of the cable.
@@ -66,102 +65,30 @@ class EmulatedBus:
     """
 
     def __init__(self, servos: Iterable[Sts3215], *, echo: bool = False, seed: int = 0) -> None:
-        self.servos, self.echo = list(servos), echo
-        self.host_baud = self.baud = SERVO_BAUDS[0]
-        self.lines: deque[tuple[float, bytes]] = deque(maxlen=1000)
-        """The last packets that came in, and when each ended."""
-        self.unplugged = 0
-        self._random = random.Random(seed)
-        self._incoming: deque[tuple[float, bytes]] = deque()
-        self._outgoing: list[tuple[float, int]] = []
-        self._heard = b""
-        self._heard_until_s, self._now_s = 0.0, 0.0
-        self._faults: list[Fault] = []
-        self._edges: list[tuple[float, int, bool, Fault]] = []
-
-    def add_faults(self, faults: Iterable[Fault]) -> None:
-        """Let things go wrong, at the times the faults say. Raises :class:`UnknownChoice` for a kind that no bus has."""
-        for fault in faults:
-            require_choice("fault", fault.kind, tuple(SERVO_FAULTS))
-            self._faults.append(fault)
-            heapq.heappush(self._edges, (fault.start_s, len(self._faults), True, fault))
-            if math.isfinite(fault.duration_s):
-                heapq.heappush(self._edges, (fault.end_s, len(self._faults), False, fault))
-        self.advance(self._now_s)
+        super().__init__(SERVO_BAUDS[0], seed)
+        self.servos, self.echo, self._heard = list(servos), echo, b""
 
     @property
     def title(self) -> str:
         """Which servos there are."""
         return f"STS3215 servos {', '.join(str(servo['id']) for servo in self.servos)}"
 
-    @property
-    def plugged(self) -> bool:
-        """Whether the port is there."""
-        return not self._active("unplug")
+    def add_faults(self, faults: Iterable[Fault]) -> None:
+        """As the base class. Raises :class:`UnknownChoice` for a kind that no bus has."""
+        listed = list(faults)
+        for fault in listed:
+            require_choice("fault", fault.kind, tuple(SERVO_FAULTS))
+        super().add_faults(listed)
 
-    def write(self, data: bytes, t_s: float) -> None:
-        """Bytes from the computer; they arrive one after the other at the line's pace."""
-        self.advance(t_s)
-        begin_s, byte_s = max(t_s, self._heard_until_s), BITS_PER_BYTE / self.host_baud
-        for number, byte in enumerate(data):
-            self._incoming.append((begin_s + (number + 1) * byte_s, bytes([byte])))
-        self._heard_until_s = begin_s + len(data) * byte_s
-
-    def read(self, t_s: float, size: int | None = None) -> bytes:
-        """Up to ``size`` bytes that have come back by ``t_s``; all of them without ``size``."""
-        self.advance(t_s)
-        count = 0
-        while count < len(self._outgoing) and self._outgoing[count][0] <= t_s and (size is None or count < size):
-            count += 1
-        out, self._outgoing = self._outgoing[:count], self._outgoing[count:]
-        return bytes(byte for _, byte in out)
-
-    def waiting(self, t_s: float) -> int:
-        """Number of bytes that have come back and were not read."""
-        self.advance(t_s)
-        return sum(at_s <= t_s for at_s, _ in self._outgoing)
-
-    def next_event_s(self) -> float | None:
-        """When something may happen next that the computer could notice; None if nothing is under way."""
-        times = [queue[0][0] for queue in (self._incoming, self._outgoing, self._edges) if queue]
-        return min(times) if times else None
-
-    def sending_until_s(self) -> float:
-        """When the last byte written will have arrived."""
-        return self._heard_until_s
-
-    def forget_input(self) -> None:
-        """Throw away what has come back, as opening or flushing a port does."""
-        self._outgoing = [pair for pair in self._outgoing if pair[0] > self._now_s]
-
-    def advance(self, t_s: float) -> None:
-        """Let everything happen up to ``t_s``, in order."""
-        while True:
-            byte_s = self._incoming[0][0] if self._incoming else math.inf
-            edge_s = self._edges[0][0] if self._edges else math.inf
-            if min(byte_s, edge_s) > t_s:
-                break
-            self._follow(min(byte_s, edge_s))
-            if edge_s <= byte_s:
-                _, _, begins, fault = heapq.heappop(self._edges)
-                self._edge(fault, begins)
-            else:
-                self._hear(*self._incoming.popleft())
-        self._follow(t_s)
-
-    def _active(self, kind: str) -> Fault | None:
-        return next((fault for fault in self._faults if fault.kind == kind and fault.active(self._now_s)), None)
+    def _pieces(self, data: bytes) -> Iterable[bytes]:
+        return (bytes([byte]) for byte in data)
 
     def _edge(self, fault: Fault, begins: bool) -> None:
         """A fault begins or ends."""
-        if not begins:
-            self._faults.remove(fault)
         of = [servo for servo in self.servos if servo["id"] == int(fault.amount)]
         if fault.kind == "unplug":
-            self.unplugged += begins
-            self._incoming.clear()
-            self._outgoing.clear()
-            self._heard_until_s, self._heard = self._now_s, b""
+            self._pull_out(begins)
+            self._heard = b""
         elif fault.kind == "brownout":
             for servo in self.servos:
                 servo.power_up()
@@ -178,11 +105,11 @@ class EmulatedBus:
                 servo.step(t_s - self._now_s)
             self._now_s = t_s
 
-    def _hear(self, t_s: float, byte: bytes) -> None:
+    def _hear(self, t_s: float, piece: bytes) -> None:
         """A byte has arrived at all servos."""
         if self.echo:
-            self._say(t_s, byte)
-        self._heard = (self._heard + byte)[-300:]
+            self._say(t_s, piece)
+        self._heard = (self._heard + piece)[-300:]
         found = find_packets(self._heard)
         if found:
             self._heard = b""
@@ -208,7 +135,7 @@ class EmulatedBus:
         to, instruction, data = body[0], body[2], body[3:]
         servos = self._there()
         if to == BROADCAST and instruction == SYNC_READ and len(data) > 2:
-            slot_s = (6 + data[1] + GAP_BYTES) * BITS_PER_BYTE / self.host_baud
+            slot_s = (REPLY_BYTES + data[1] + GAP_BYTES) * BITS_PER_BYTE / self.host_baud
             for number, wanted in enumerate(data[2:]):
                 for servo in (each for each in servos if each["id"] == wanted):
                     self._answer(t_s + number * slot_s, servo, _memory(servo, data[0], data[1]))
@@ -235,15 +162,14 @@ class EmulatedBus:
                 servo.reset()
             elif instruction != PING:
                 continue
-            slot_s = told * (6 + GAP_BYTES) * BITS_PER_BYTE / self.host_baud if to == BROADCAST else 0.0
+            slot_s = told * (REPLY_BYTES + GAP_BYTES) * BITS_PER_BYTE / self.host_baud if to == BROADCAST else 0.0
             if (to != BROADCAST or instruction == PING) and (servo["response_level"] or instruction in (PING, READ)):
                 self._answer(t_s + slot_s, servo, answer, told)
 
     def _answer(self, t_s: float, servo: Sts3215, data: bytes, told: int | None = None) -> None:
         if (lost := self._active("drop")) and self._random.random() < lost.amount:
             return
-        body = bytes([servo["id"] if told is None else told, len(data) + 2, servo["status"]]) + data
-        reply = b"\xff\xff" + body + bytes([checksum(body)])
+        reply = packet(servo["id"] if told is None else told, servo["status"], data)
         if (broken := self._active("truncate")) and self._random.random() < broken.amount:
             reply = reply[: self._random.randrange(1, len(reply))]
         if damaged := self._active("corrupt"):
@@ -263,7 +189,7 @@ class EmulatedBus:
                     break
             else:
                 self._outgoing.append((at_s, byte))
-        self._outgoing.sort()
+        self._outgoing = deque(sorted(self._outgoing))
 
 
 def emulated_buses(config: HardwareConfig) -> dict[str, EmulatedBus]:
