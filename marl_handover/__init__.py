@@ -19,6 +19,7 @@ def _register(gymnasium: ModuleType) -> None:
         gymnasium.register(
             id=f"marl_handover/Supervisor{architecture}-v0",
             entry_point="marl_handover.envs.goal_env:SupervisorGoalEnv",
+            vector_entry_point="marl_handover.envs.goal_vector_env:SupervisorVectorEnv",
             kwargs={"architecture": architecture},
         )
     from marl_handover.files import resource_path  # here, as Gymnasium

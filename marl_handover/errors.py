@@ -135,12 +135,29 @@ class InvalidSetting(HandoverError):
         self.name, self.value, self.limit = name, value, limit
 
 
+class GoalInObservation(InvalidSetting):
+    """A goal environment was to show a layout that depends on the goal, of which a hindsight buffer would keep the old one."""
+
+    def __init__(self, layout: str, instead: str) -> None:
+        limit = f"{instead!r} here: others contain the goal, which hindsight replaces in desired_goal only; env.features() computes them"
+        super().__init__("layout", layout, limit)
+
+
 class UnknownChoice(HandoverError):
     """A name is none of the valid choices."""
 
     def __init__(self, name: str, value: Any, choices: Iterable[str]) -> None:
         self.name, self.value, self.choices = name, value, tuple(choices)
         super().__init__(f"{shortened(name)} = {shown(value)} is not known; choose one of: {listed(self.choices)}")
+
+
+class NoWindow(UnknownChoice):
+    """A window was asked for where there is none to be had."""
+
+    def __init__(self, value: str, choices: Iterable[Any], why: str) -> None:
+        super().__init__("render_mode", value, choices)
+        self.args = (f"render_mode = {value!r} needs a window: {why}; choose one of: {listed(self.choices)}",)
+        self.why = why
 
 
 class UnknownKey(HandoverError):

@@ -12,7 +12,7 @@ import textwrap
 import tokenize
 import types
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 
@@ -281,3 +281,20 @@ def _notes(schema: type) -> dict[str, _FieldNotes]:
                     doc = " ".join(str(following.value.value).split())
                 notes[statement.target.id] = _FieldNotes(ast.unparse(statement.annotation), doc)
     return notes
+
+
+def with_settings(settings: Any, changes: Mapping[str, Any], prefix: str = "") -> Any:
+    """A copy of the dataclass instance ``settings`` with single fields changed; a mapping changes fields of a section.
+
+    Raises:
+        UnknownKey: there is no such field. ``prefix`` goes before its name.
+    """
+    names = [item.name for item in fields(settings)]
+    values = {}
+    for name, value in changes.items():
+        if name not in names:
+            raise UnknownKey(prefix + name, [prefix + each for each in closest_first(name, names)])
+        section = getattr(settings, name)
+        nested = isinstance(value, Mapping) and is_dataclass(section)
+        values[name] = with_settings(section, value, f"{prefix}{name}.") if nested else value
+    return replace(settings, **values)

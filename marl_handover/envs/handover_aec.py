@@ -15,8 +15,9 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
-from pettingzoo import AECEnv
+from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import wrappers
+from pettingzoo.utils.conversions import turn_based_aec_to_parallel_wrapper
 
 from marl_handover.arrays import Floats
 from marl_handover.cell import CellModel, build_whole_cell, cell_config
@@ -132,6 +133,18 @@ class HandoverEnv(AECEnv):
         self.possible_agents = list(self.spaces.action)
         self.agents: list[str] = []
         self._random: np.random.Generator | None = None
+
+    def __repr__(self) -> str:
+        """What it is, and the settings that matter most."""
+        config, backend = self.rules.config, type(self.backend).__name__
+        return (
+            f"HandoverEnv(architecture={config.architecture!r}, cell={self.rules.cell.config.name!r}, backend={backend}, "
+            f"epsilon_deg={config.epsilon_deg:g}, agents={self.possible_agents})"
+        )
+
+    def __str__(self) -> str:
+        """Its name, as PettingZoo has it."""
+        return str(self.metadata["name"])
 
     def observation_space(self, agent: str) -> gymnasium.spaces.Dict:
         """What ``agent`` sees."""
@@ -317,3 +330,12 @@ def raw_env(**settings: Any) -> HandoverEnv:
 def env(**settings: Any) -> AECEnv:
     """The environment as PettingZoo ships its own: steps out of order raise. Settings as :class:`HandoverEnv` has them."""
     return wrappers.OrderEnforcingWrapper(HandoverEnv(**settings))
+
+
+def parallel_env(**settings: Any) -> ParallelEnv:
+    """The same for learners that step all agents at once: of the actions, that of the agent whose turn it is counts.
+
+    Whose that is, ``infos[agent]["active_agent"]`` says after every step; after a reset it is the supervisor's. Settings as
+    :class:`HandoverEnv` has them.
+    """
+    return turn_based_aec_to_parallel_wrapper(env(**settings))

@@ -96,6 +96,16 @@ class SupervisorEnv(EnvBase):
         flag = Binary(shape=(count, 1), dtype=torch.bool, device=device)
         self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=self.batch_size, device=device)
 
+    def __repr__(self) -> str:
+        """What it is, and the settings that matter most."""
+        config, cell = self.rules.config, "random" if self.layouts is not None else self.rules.cell.config.name
+        low, high = (math.degrees(value) for value in self.epsilon_range_rad)
+        return (
+            f"SupervisorEnv(num_envs={self.batch_size[0]}, architecture={config.architecture!r}, cell={cell!r}, "
+            f"epsilon_deg={f'{low:g}' if low == high else f'{low:g} to {high:g}'}, max_steps={config.max_steps}, "
+            f"layout={config.layout!r}, device={str(self.device)!r})"
+        )
+
     def set_epsilon_range(self, low_deg: float, high_deg: float) -> None:
         """Draw each new episode's epsilon log-uniformly from this range, in degrees."""
         require_positive("epsilon low", low_deg)

@@ -13,10 +13,11 @@ import pytest
 from marl_handover.arrays import wrap
 from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import MotionConfig, NoiseConfig, TaskConfig
-from marl_handover.envs.backends import BLOCK, GOAL, PLACE, Correctable, KinematicBackend, NoisyBackend, Refusal, TopView, make_backend
+from marl_handover.envs.backends import Correctable, KinematicBackend, NoisyBackend, Refusal, make_backend
 from marl_handover.envs.collision_check import CollisionFinder
 from marl_handover.envs.cycle_check import JOIN_TOLERANCE_RAD, CycleCheck, welded
 from marl_handover.envs.spaces import read_cycle
+from marl_handover.envs.top_view import BLOCK, GOAL, PLACE, TopView
 from marl_handover.errors import InvalidSetting, UnknownChoice
 from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.motion.pick_place import timed_phases

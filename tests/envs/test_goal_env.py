@@ -13,10 +13,14 @@ from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDict
 
 import marl_handover
-from marl_handover.config import NoiseConfig, RewardConfig, TaskConfig
-from marl_handover.envs import SupervisorEnv, SupervisorGoalEnv
-from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, UnknownKey
+from marl_handover.arrays import namespace
+from marl_handover.config import LAYOUTS, NoiseConfig, RewardConfig, TaskConfig
+from marl_handover.envs import SupervisorEnv, SupervisorGoalEnv, goal_env
+from marl_handover.envs.top_view import TopView, rgb
+from marl_handover.errors import GoalInObservation, InvalidSetting, NotFinite, NoWindow, OutOfReach, UnknownChoice, UnknownKey
 from marl_handover.motion.path_length_table import motion_cost
+from marl_handover.palette import arm_colour
+from marl_handover.task.observations import Layout, observe
 from marl_handover.task.rules import Outcome
 
 architectures = pytest.mark.parametrize("architecture", ["A", "B"])
@@ -98,7 +102,8 @@ def test_the_step_limit_is_in_the_specification_and_no_wrapper_cuts_it():
     assert ends == [False] * 39 + [True]
 
 
-def test_pictures_or_a_refusal_when_it_is_made():
+def test_pictures_or_a_refusal_when_it_is_made(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
     env = made(render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
@@ -108,6 +113,58 @@ def test_pictures_or_a_refusal_when_it_is_made():
     assert (first != env.render()).any()
     with pytest.raises(UnknownChoice, match="rgb_array"):
         SupervisorGoalEnv(render_mode="human")
+    with pytest.raises(NoWindow, match="DISPLAY"):
+        made(render_mode="human")
+    with pytest.raises(UnknownChoice, match="choose one of: rgb_array, human"):
+        SupervisorGoalEnv(render_mode="ansi")
+
+
+def test_the_window_is_shown_every_step(monkeypatch):
+    pictures = []
+
+    class Screen:
+        def __init__(self, fps):
+            assert fps == SupervisorGoalEnv.metadata["render_fps"]
+
+        def show(self, picture):
+            pictures.append(picture)
+
+        def close(self):
+            pictures.append("closed")
+
+    monkeypatch.setattr(goal_env, "Window", Screen)
+    env = made(render_mode="human")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.close()
+    assert len(pictures) == 3
+    assert pictures[0].shape == (320, 320, 3)
+    assert pictures[-1] == "closed"
+
+
+def test_the_hand_is_where_the_block_was_put():
+    """Architecture B, the left arm takes the block to the goal; the arm's colour is around it, and was not before."""
+    env = made(render_mode="rgb_array")
+    env.reset(options=EASY)
+    assert not around(env, EASY["goal"], rgb(arm_colour(0)))
+    env.step(np.array([1, -1, 0, 0], np.float32))
+    assert around(env, EASY["goal"], rgb(arm_colour(0)))
+
+
+def around(env, pose, colour):
+    """Whether pixels near a pose have a colour."""
+    picture, half = env.render(), TopView(env.unwrapped.rules.cell).half_mm
+    column, row = ((np.array([pose[0], -pose[1]]) / half + 1) / 2 * len(picture)).astype(int)
+    return (picture[row - 20 : row + 20, column - 20 : column + 20] == colour).all(-1).sum() > 20
+
+
+def test_a_film_of_an_episode_is_recorded(tmp_path):
+    pytest.importorskip("moviepy")
+    env = gymnasium.wrappers.RecordVideo(made(render_mode="rgb_array"), str(tmp_path / "films"), episode_trigger=lambda number: number == 0)
+    env.reset(options=EASY)
+    env.step(np.array([1, -1, 0, 0], np.float32))
+    env.close()
+    assert (tmp_path / "films" / "rl-video-episode-0.mp4").stat().st_size > 1000
 
 
 def test_the_observation_has_no_goal():
@@ -268,3 +325,88 @@ def test_the_motion_cost_is_recomputed_too():
     assert length > math.hypot(200, 180)
     assert reward == pytest.approx(-1 - length / 100)
     assert env.compute_reward(after["achieved_goal"], after["desired_goal"], info) == pytest.approx(reward)
+
+
+def test_a_final_command_is_judged_as_if_the_other_goal_had_been_there():
+    """The oracle sets the same block and the other goal, gives the same command, and looks."""
+    env, twin = SupervisorGoalEnv("B", epsilon_deg=40.0), SupervisorGoalEnv("B", epsilon_deg=40.0)
+    rows = [(action, after, info) for _, action, after, _, _, _, info in walk(env, 1500)]
+    random, rewards = np.random.default_rng(1), []
+    for action, after, info in rows:
+        if not info["final"]:
+            continue
+        goal = rows[random.integers(len(rows))][1]["achieved_goal"]
+        twin.reset(options={"state": info["start"], "goal": goal})
+        _, reward, terminated, _, _ = twin.step(action)
+        assert env.compute_reward(after["achieved_goal"], goal, info) == reward
+        assert terminated
+        rewards.append(reward)
+    assert set(rewards) == {20, -30}
+
+
+def test_no_end_of_an_episode_depends_on_the_goal():
+    """So a hindsight buffer that keeps ``done`` as it was is right."""
+    env = made("B").unwrapped
+    for _, _, after, _, terminated, _, info in walk(env, 500):
+        for goal in (after["achieved_goal"], after["desired_goal"], np.array([200.0, 180.0, 1.0], np.float32)):
+            assert env.compute_terminated(after["achieved_goal"], goal, info) == terminated
+
+
+@pytest.mark.parametrize("cell", ["paper", "triangle"])
+def test_features_are_the_layout_of_the_goal_that_is_there(cell):
+    layout = "relative" if cell == "paper" else "graph"
+    env, other = SupervisorGoalEnv(cell=cell), SupervisorGoalEnv(cell=cell, scale_goals=True)
+    seen = [step[2] for step in walk(env, 100)] if cell == "paper" else [env.reset(seed=seed)[0] for seed in range(20)]
+    batch = {key: np.stack([each[key] for each in seen]) for key in seen[0]}
+    previous = batch["observation"][:, 3:]
+    arm = np.where(previous[:, 0] == 0, -1, np.where(previous[:, 0] > 0, 1, 0)) if cell == "paper" else np.full(len(seen), -1)
+    expected = observe(env.rules, layout, batch["achieved_goal"], batch["desired_goal"], arm)
+    np.testing.assert_array_equal(env.features(batch, layout), expected)
+    tensors = {key: torch.tensor(value) for key, value in batch.items()}
+    np.testing.assert_allclose(env.features(tensors, layout).numpy(), expected, atol=2e-3)
+    scaled = {key: value if key == "observation" else (value / other._unit).astype(np.float32) for key, value in batch.items()}
+    np.testing.assert_allclose(other.features(scaled, layout), expected, atol=2e-3)
+
+
+def test_scaled_goals_are_the_same_problem():
+    env, scaled = SupervisorGoalEnv("B", epsilon_deg=40.0), SupervisorGoalEnv("B", epsilon_deg=40.0, scale_goals=True)
+    for one, same in zip(walk(env, 300), walk(scaled, 300), strict=True):
+        np.testing.assert_allclose(same[2]["achieved_goal"] * scaled._unit, one[2]["achieved_goal"], atol=1e-4)
+        assert np.abs(same[2]["desired_goal"]).max() <= 1.01
+        assert scaled.observation_space.contains(same[2])
+        assert one[3:] == same[3:]
+        assert scaled.compute_reward(same[2]["achieved_goal"], same[2]["desired_goal"], same[6]) == same[3]
+
+
+def test_single_rewards_can_be_given_to_make():
+    reward = made(reward={"success": 2.0}).unwrapped.rules.config.reward
+    assert (reward.success, reward.step) == (2.0, RewardConfig().step)
+    with pytest.raises(UnknownKey, match=r"reward\.sucess.*reward\.success"):
+        made(reward={"sucess": 2.0})
+
+
+def test_a_layout_of_ones_own_is_taken_if_it_does_not_show_the_goal(no_new_plugins):
+    def polar(rules, pose, goal, previous_arm, epsilon_rad):
+        xp = namespace(pose)
+        return xp.stack([pose[..., 0] / 100, xp.cos(pose[..., 2])], -1)
+
+    def sneaky(rules, pose, goal, previous_arm, epsilon_rad):
+        return polar(rules, pose, goal, previous_arm, epsilon_rad) + 1e-6 * goal[..., :2]
+
+    LAYOUTS.register("polar")(Layout(polar, lambda num_arms: 2))
+    LAYOUTS.register("sneaky")(Layout(sneaky, lambda num_arms: 2))
+    env = made(layout="polar")
+    assert env.reset(seed=0)[0]["observation"].shape == (2,)
+    with pytest.raises(GoalInObservation):
+        made(layout="sneaky")
+    with pytest.raises(InvalidSetting, match="object"):
+        env.unwrapped.features(env.reset()[0])
+
+
+def test_it_says_what_it_is():
+    assert repr(SupervisorGoalEnv("A", epsilon_deg=1.0)) == (
+        "SupervisorGoalEnv(architecture='A', cell='paper', epsilon_deg=1, max_steps=20, layout='object')"
+    )
+    assert repr(SupervisorEnv(3)).startswith(
+        "SupervisorEnv(num_envs=3, architecture='B', cell='paper', epsilon_deg=5, max_steps=20, layout='relative'"
+    )

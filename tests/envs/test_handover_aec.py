@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from pettingzoo.test import api_test, render_test, seed_test
+from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 from torchrl.envs.utils import check_env_specs
 
@@ -19,7 +19,8 @@ from marl_handover.cell import build_cell, cell_config
 from marl_handover.config import LoopConfig, MotionConfig, NoiseConfig, RewardConfig, TaskConfig
 from marl_handover.control.closed_loop import make_loop
 from marl_handover.envs import SupervisorEnv, handover_aec
-from marl_handover.envs.backends import GOAL, KinematicBackend, Refusal
+from marl_handover.envs.backends import KinematicBackend, Refusal
+from marl_handover.envs.top_view import GOAL
 from marl_handover.errors import InvalidSetting, NotFinite, OutOfReach, UnknownChoice, UnknownKey
 from marl_handover.motion.executor import ExecutorAgent
 from marl_handover.motion.path_length_table import motion_cost
@@ -89,6 +90,35 @@ def test_pettingzoos_api_test(make, architecture, model):
 @pytest.mark.parametrize("backend", ["kinematic", "noisy"])
 def test_pettingzoos_seed_test(architecture, backend, model):
     seed_test(lambda: handover_aec.env(cell=model, architecture=architecture, backend=backend), num_cycles=100)
+
+
+@architectures
+def test_pettingzoos_parallel_test(architecture, model):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parallel_api_test(handover_aec.parallel_env(cell=model, architecture=architecture), num_cycles=100)
+
+
+def test_the_parallel_environment_takes_the_turns_of_the_other(model):
+    """Every agent acts at random in both; what counts is what the one whose turn it is says."""
+    turns, parallel = handover_aec.env(cell=model), handover_aec.parallel_env(cell=model)
+    turns.reset(seed=3)
+    observations, _ = parallel.reset(seed=3)
+    active, steps = "supervisor", 0
+    for agent in parallel.possible_agents:
+        parallel.action_space(agent).seed(0)
+    while parallel.agents:
+        assert active == turns.agent_selection
+        actions = {agent: parallel.action_space(agent).sample() for agent in parallel.agents}
+        observations, rewards, *_, infos = parallel.step(actions)
+        turns.step(actions[active])
+        assert rewards == turns.rewards
+        for agent, seen in observations.items():
+            for key, value in turns.observe(agent).items():
+                np.testing.assert_array_equal(seen[key], value)
+        steps, active = steps + 1, infos["supervisor"].get("active_agent", "")
+    assert steps >= 2
+    assert turns.terminations["supervisor"] or turns.truncations["supervisor"]
 
 
 def test_pettingzoos_render_test(model, capsys):
