@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from marl_handover.config import CELL_ALIASES, path_field
+from marl_handover.config import CELL_ALIASES, bounded, path_field
 from marl_handover.control.evaluation import AssessmentConfig, assess
 from marl_handover.errors import InvalidSetting, MissingFile, counted
 from marl_handover.experiments.provenance import commit
@@ -18,6 +19,9 @@ from marl_handover.learning.evaluation import Evaluation
 from marl_handover.learning.recorder import machine
 from marl_handover.task.rules import Outcome
 
+if TYPE_CHECKING:
+    from marl_handover.control.recording import Recorder
+
 
 @dataclass
 class EvaluateCommand(AssessmentConfig):
@@ -25,6 +29,8 @@ class EvaluateCommand(AssessmentConfig):
 
     json: str = path_field()  # file for the result
     trace: str = path_field()  # file for every transfer
+    record: str = path_field()  # of twin: folder that is made for a LeRobotDataset of the episodes
+    record_fps: int = bounded(10, 1, 50)  # its frames a second
     progress: bool = True
 
 
@@ -40,8 +46,11 @@ def run(config: EvaluateCommand) -> int:
             raise MissingFile("folder", Path(path).parent, "make it first")
         if path and Path(path).is_dir():
             raise InvalidSetting(name, path, "a file, not a folder")
-    done = assess(config, traced=bool(config.trace), progress=config.progress)
+    with _recording(config) as recorder:
+        done = assess(config, traced=bool(config.trace), progress=config.progress, recorder=recorder)
     print(table(done.report, done.result))
+    if recorder is not None:
+        print(f"\n{recorder.told()}")
     if config.json:
         if config.ladder:  # what an entry of the ladder has to say besides
             done.report.update(commit=commit(), machine=machine())
@@ -49,6 +58,17 @@ def run(config: EvaluateCommand) -> int:
     if config.trace:
         write_whole(Path(config.trace), done.trace_text())
     return 0
+
+
+def _recording(config: EvaluateCommand) -> AbstractContextManager[Recorder | None]:
+    """What records the episodes, if that is asked for."""
+    if not config.record:
+        return nullcontext()
+    if config.backend != "twin":
+        raise InvalidSetting("record", config.record, "left out, or backend=twin, whose camera shows the arms")
+    from marl_handover.control.recording import recording
+
+    return recording(config.record, config.record_fps)
 
 
 def table(report: dict[str, Any], result: Evaluation) -> str:

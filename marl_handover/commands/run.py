@@ -46,6 +46,8 @@ class RunCommand(WorkcellConfig):
     printed: bool = False  # of the twin: the goal is a printed marker that the camera has to see
     dry_run: bool = False  # everything but the last write: nothing moves
     log: str = path_field()  # file for every event, JSON Lines
+    record: str = path_field()  # folder that is made for a LeRobotDataset of the episodes: joints, hands, camera, task, success
+    record_fps: int = bounded(10, 1, 50)  # its frames a second
     publish: str = path_field()  # folder in which the session shows itself to marl-handover view live=FOLDER; empty: it does not
     view_control: bool = False  # whether that folder's pages may pause the session and give it goals; they may always stop it
     paused: bool = False  # with view_control: nothing moves before somebody presses start
@@ -66,6 +68,7 @@ def run(config: RunCommand) -> int:
     """Play and print. 0 if every episode ended at its goal, else 1."""
     from marl_handover.control.calibration import confirmed, laid_anew
     from marl_handover.control.closed_loop import make_loop
+    from marl_handover.control.recording import recording
     from marl_handover.control.session import Session
     from marl_handover.control.telemetry import Publisher
     from marl_handover.hardware.clock import follow_real_time
@@ -76,9 +79,12 @@ def run(config: RunCommand) -> int:
     about = {"policy": config.policy, "hardware": config.hardware.name, "seed": config.seed, "dry_run": config.dry_run}
     with (
         Publisher(config.publish, view_control=config.view_control, paused=config.paused, log_path=config.log) as publisher,
+        recording(config.record, config.record_fps) as recorder,
         make_loop(policy, "hardware", config.motion, config.loop, **options) as loop,
     ):
         publisher.attach(loop)
+        if recorder is not None:
+            recorder.attach(loop)
         session = Session(loop, about, publisher.command_queue)
         if config.real_time:
             follow_real_time(session.backend.clock)
@@ -93,6 +99,8 @@ def run(config: RunCommand) -> int:
         faults = {str(event): count for event, count in sorted(session.log.counts.items()) if event in _faults()}
     where = "would be at the goal (dry run: nothing moved)" if config.dry_run else "at the goal"
     print(f"{solved} of {config.episodes} {where}; what went wrong: {', '.join(f'{n} {c}' for n, c in faults.items()) or 'nothing'}")
+    if recorder is not None:
+        print(recorder.told())
     return 0 if solved == config.episodes else 1
 
 
@@ -104,6 +112,8 @@ def _check(config: RunCommand) -> None:
         raise InvalidSetting("printed", config.printed, "left out with a real cell: without goal=[x,y,deg] its goal is the printed one")
     if config.real_time and not config.emulated:
         raise InvalidSetting("real_time", config.real_time, "left out with a real cell: it knows no other time")
+    if config.record and config.dry_run:
+        raise InvalidSetting("record", config.record, "left out with dry_run=true, in which no arm moves")
     if config.log and not Path(config.log).parent.is_dir():
         raise MissingFile("folder", Path(config.log).parent, "make it first")
 

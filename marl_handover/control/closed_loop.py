@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import Any, Protocol, Self, runtime_checkable
@@ -73,6 +74,13 @@ class Stoppable(Protocol):
         """Stop all arms where they are."""
 
 
+class RecordsEpisodes(Protocol):
+    """Whoever keeps what goes on in an episode."""
+
+    def episode(self, run: _Run, /) -> AbstractContextManager[None]:
+        """A block around an episode that has begun; at its end ``run`` says how it ended."""
+
+
 Observer = Callable[[Transfer], None]
 
 HOPELESS = frozenset({Refusal.TIPPED, Refusal.STALLED})
@@ -120,6 +128,8 @@ class ClosedLoop:
         self.rules: Rules = _whole(policy.rules, planner)
         self.settings.validate(self.rules.config.max_steps)
         self.limit = self.settings.transfers
+        self.recorder: RecordsEpisodes | None = None
+        """Is asked to record every episode."""
         self._same = backend.same if isinstance(backend, TracksObject) else (SAME_MM, SAME_RAD)
 
     def __enter__(self) -> Self:
@@ -155,16 +165,17 @@ class ClosedLoop:
         begun = time.perf_counter()
         left = self.policy if outage is None else policy_without(self.policy, outage.arm)
         run = _Run(np.asarray(goal, float), self.backend.reset(np.asarray(start, float), seed), self.policy)
-        while self._goes_on(run, goals):
-            first = len(run.transfers)
-            if outage is not None and run.lost_at is None and first >= outage.after:
-                run.policy, run.lost_at = left, first
-            self._decide(run)
-            if run.ended is None:
-                self._conclude(run)
-            if observer is not None:
-                for transfer in run.transfers[first:]:
-                    observer(transfer)
+        with nullcontext() if self.recorder is None else self.recorder.episode(run):
+            while self._goes_on(run, goals):
+                first = len(run.transfers)
+                if outage is not None and run.lost_at is None and first >= outage.after:
+                    run.policy, run.lost_at = left, first
+                self._decide(run)
+                if run.ended is None:
+                    self._conclude(run)
+                if observer is not None:
+                    for transfer in run.transfers[first:]:
+                        observer(transfer)
         return Episode(run.goal, tuple(run.transfers), str(run.ended), time.perf_counter() - begun, run.lost_at)
 
     def _goes_on(self, run: _Run, goals: Callable[[], Floats] | None) -> bool:

@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -64,6 +65,7 @@ from marl_handover.task.rules import Outcome, Rules
 
 if TYPE_CHECKING:
     from marl_handover.control.closed_loop import ClosedLoop
+    from marl_handover.control.recording import Recorder
     from marl_handover.control.transfers import Episode, Transfer
 
 
@@ -126,13 +128,14 @@ class Assessment(NamedTuple):
     rules: Rules
 
 
-def assess(config: AssessmentConfig, traced: bool = False, progress: bool = False) -> Assessment:
+def assess(config: AssessmentConfig, traced: bool = False, progress: bool = False, recorder: Recorder | None = None) -> Assessment:
     """Load the policy, play every problem, judge.
 
     Args:
         config: see there.
         traced: keep what ``trace_text`` needs.
         progress: show a bar.
+        recorder: of the twin's episodes.
 
     Raises:
         InvalidSetting, UnknownChoice, MissingFile, CorruptFile, CheckpointMismatch: on bad input.
@@ -140,7 +143,8 @@ def assess(config: AssessmentConfig, traced: bool = False, progress: bool = Fals
     config.validate()
     config = _on_rung(config)
     policy = policies.adapted(config.policy, config.cell, config.seed, motion=config.motion, **vars(config.task))
-    play = _play_loop if config.backend != "kinematic" else _play_kinematic if config.layouts is None else _play_layouts
+    in_loop = partial(_play_loop, recorder=recorder)
+    play = in_loop if config.backend != "kinematic" else _play_kinematic if config.layouts is None else _play_layouts
     result, trace_text, rules, added = play(config, policy, traced, progress)
     report = {
         "policy": config.policy,
@@ -306,7 +310,7 @@ def _all_of(observers: Sequence[Observer]) -> Observer | None:
     return each if observers else None
 
 
-def _play_loop(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool, progress: bool) -> Played:
+def _play_loop(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool, progress: bool, recorder: Recorder | None) -> Played:
     """One problem after the other, in closed loop."""
     # Planner and simulator are imported where they are needed: the kinematic evaluation starts without them.
     from marl_handover.control.closed_loop import make_loop
@@ -316,6 +320,8 @@ def _play_loop(config: AssessmentConfig, policy: SupervisorPolicy, traced: bool,
     started = time.perf_counter()
     options = backend_options(config)
     with make_loop(policy, config.backend, config.motion, config.loop, **options) as loop:
+        if recorder is not None:
+            recorder.attach(loop)
         rules, decides, backend = loop.rules, loop.policy.rules, loop.backend
         for note in getattr(backend, "notes", ()):
             print(note, file=sys.stderr)

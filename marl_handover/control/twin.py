@@ -106,8 +106,7 @@ class Twin:
         """The electronics' settings, of the cell's arms alone, their ports those of the emulated boards."""
         self.cell = SimulatedCell(model, motion, engine=config.twin.engine)
         self.follower = ServoFollower(self.cell, self._servos)
-        truth = hung_camera(*camera_over(model, config))
-        self.painter = CellPainter(model, truth, config.target, config.look, config.twin.seed)
+        self.painter = self._painter(config.twin.seed)
         self.camera = RenderedCamera(self._picture, config.camera.max_age_s, self.clock.now_s)
         self.goal: Floats | None = None
         """Where a printed goal lies (3,); None: there is none."""
@@ -116,6 +115,7 @@ class Twin:
         self._sheets: list[tuple[Sheet, Floats]] = []
         self._cards: list[tuple[Sheet, Floats]] = []
         self._last: Pixels | None = None
+        self._onlooker: CellPainter | None = None
         self._number = 0
         self.clock.at(SERVO_S, self._tick)
         self.clock.until(_BOOTED_S)
@@ -136,6 +136,14 @@ class Twin:
         """Somebody puts the block at ``pose`` (3,), standing."""
         self.cell.block.place(np.asarray(pose, float))
         self.follower.disturbed()
+
+    def watched(self) -> Pixels:
+        """What the camera shows now, BGR, for who only watches: with noise of its own, so that the session's pictures stay as they are."""
+        now_s = self.clock.now_s()
+        if self._last is not None and now_s < self.frozen_until_s:
+            return self._last
+        self._onlooker = self._onlooker or self._painter(self.config.twin.seed + 1)
+        return self._painted(now_s, self._onlooker)
 
     def hide(self, duration_s: float) -> None:
         """Somebody holds a hand over the block."""
@@ -209,17 +217,21 @@ class Twin:
         now_s = self.clock.now_s()
         self._number += 1
         if self._last is None or now_s >= self.frozen_until_s:
-            self._last = self._painted(now_s)
+            self._last = self._painted(now_s, self.painter)
         return Frame(self._last, now_s, self._number)
 
-    def _painted(self, now_s: float) -> Pixels:
+    def _painter(self, seed: int) -> CellPainter:
+        truth = hung_camera(*camera_over(self.model, self.config))
+        return CellPainter(self.model, truth, self.config.target, self.config.look, seed)
+
+    def _painted(self, now_s: float, painter: CellPainter) -> Pixels:
         joints = self.true_joints_rad()
         fingers = [arm.gripper_mm() for arm in self.cell.arms]
         sheets = list(self._sheets)
         for base, q, (card, T_grip_card) in zip(self.model.cell.bases, joints, self._cards, strict=False):
             sheets.append((card, base.matrix() @ self.model.arm.fk(q) @ T_grip_card))
         block = None if now_s < self.hidden_until_s or self._sheets else self.cell.block.transform()
-        return self.painter.picture(block, joints, self.goal, fingers, sheets)
+        return painter.picture(block, joints, self.goal, fingers, sheets)
 
     def _tidy_up(self) -> None:
         """Open the hands, set the block down, turn the arms to the parked pose: raised first, then the rest."""

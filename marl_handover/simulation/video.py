@@ -27,6 +27,8 @@ FORMATS = (".mp4", ".gif")
 Add = Callable[[Pixels], None]
 
 _QUALITY = 25  # x264's constant rate factor, less is better
+_SEEKABLE = ("-g", "2", "-bf", "0", "-preset", "veryfast")
+"""Every second picture whole, none that waits for a later one."""
 _ENDING_S = 600.0
 
 
@@ -49,21 +51,23 @@ class Video:
         path: of the file; its suffix says the format.
         fps: frames a second.
         name: of the setting, for errors.
+        seekable: whether any picture of an MP4 is to be found without decoding many before it; the file is larger.
 
     Raises:
         CannotWrite: there is no room for the file, or the encoder failed.
         MissingProgram: there is no ffmpeg, which writes MP4.
     """
 
-    def __init__(self, path: Path | str, fps: float, name: str = "video") -> None:
-        self.path, self._fps = require_video(name, path), fps
+    def __init__(self, path: Path | str, fps: float, name: str = "video", seekable: bool = False) -> None:
+        self.path, self._fps, self._seekable = require_video(name, path), fps, seekable
         require_between("fps", fps, 1, 50)
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         suffix = self.path.suffix.lower()
         temporary = self._stack.enter_context(replacing(self.path, suffix))
-        self.add = self._stack.enter_context((_mp4 if suffix == ".mp4" else _gif)(temporary, self._fps))
+        film = _mp4(temporary, self._fps, self._seekable) if suffix == ".mp4" else _gif(temporary, self._fps)
+        self.add = self._stack.enter_context(film)
         """Append one frame, RGB (height, width, 3)."""
         return self
 
@@ -81,14 +85,14 @@ def _gif(path: Path, fps: float) -> Iterator[Add]:
 
 
 @contextmanager
-def _mp4(path: Path, fps: float) -> Iterator[Add]:
+def _mp4(path: Path, fps: float, seekable: bool) -> Iterator[Add]:
     """Frames for ffmpeg, which is started with the first one, and whose end is looked at: a film that it gave up is no film."""
     process: subprocess.Popen[bytes] | None = None
     with tempfile.TemporaryFile() as said:
 
         def add(frame: Pixels) -> None:
             nonlocal process
-            process = process or _ffmpeg(path, fps, frame.shape, said)
+            process = process or _ffmpeg(path, fps, frame.shape, said, seekable)
             assert process.stdin is not None
             try:
                 process.stdin.write(np.ascontiguousarray(frame, np.uint8).data)
@@ -107,13 +111,23 @@ def _mp4(path: Path, fps: float) -> Iterator[Add]:
                 process.wait()
 
 
-def _ffmpeg(path: Path, fps: float, shape: tuple[int, ...], said: BinaryIO) -> subprocess.Popen[bytes]:
+def _ffmpeg(path: Path, fps: float, shape: tuple[int, ...], said: BinaryIO, seekable: bool) -> subprocess.Popen[bytes]:
     try:
         program = get_ffmpeg_exe()
     except RuntimeError as error:
         raise MissingProgram("a video that ends in .mp4", "ffmpeg", "install it, set IMAGEIO_FFMPEG_EXE, or ask for .gif") from error
     frames = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{shape[1]}x{shape[0]}", "-r", f"{fps:g}", "-i", "-"]
-    film = ["-an", "-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", str(_QUALITY), str(path.absolute())]
+    film = [
+        "-an",
+        "-vcodec",
+        "libx264",
+        "-pix_fmt",
+        "yuv420p",
+        "-crf",
+        str(_QUALITY),
+        *(_SEEKABLE if seekable else ()),
+        str(path.absolute()),
+    ]
     # In a session of its own: Ctrl-C in the terminal is for us, who then end it.
     command = [program, "-y", "-loglevel", "error", *frames, *film]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, start_new_session=True)
