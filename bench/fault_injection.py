@@ -15,11 +15,13 @@ from marl_handover.control.events import Event
 from marl_handover.control.session import GivenGoal
 from marl_handover.control.twin import Floats, Twin
 from marl_handover.hardware.emulator.device import make_fault
+from marl_handover.hardware.emulator.servo_bus import SERVO_FAULTS, USUAL
 from marl_handover.task.rules import Rules
 
 NUDGE_MM, NUDGE_RAD = 20.0, math.radians(20.0)
 _AGAIN_S = 0.05
 _JAMMED_S, _FROZEN_S, _LOST_S, _OFF_S = 3.0, 1.0, 1.0, 0.3
+_CORRUPT = 0.02
 _ON_TABLE_MM = 0.5
 _OPEN_SLACK_MM = 3.0
 _TRIES = 100
@@ -37,6 +39,14 @@ SIGNS = {
     "brown_out": (Event.CONTROLLER_RESET, Event.SERIAL_LOST),
 }
 """What the loop notes of each mishap that it has to get over; of a nudge between two looks it need not notice anything."""
+
+BUS_SIGNS = {
+    "bus_silent": (Event.SERIAL_LOST,),
+    "servo_missing": (Event.SERIAL_LOST,),
+    "overload": (Event.CONTROLLER_RESET, Event.PULSE_MISMATCH),
+    "corrupt_replies": (),
+}
+"""The same of those that only a bus of servos knows."""
 
 
 @dataclass
@@ -58,7 +68,8 @@ class InjectedFault:
     @property
     def felt(self) -> bool:
         """Whether it happened and left its sign in the log."""
-        return self.happened and (not SIGNS[self.kind] or bool(self.noted & set(SIGNS[self.kind])))
+        signs = (SIGNS | BUS_SIGNS)[self.kind]
+        return self.happened and (not signs or bool(self.noted & set(signs)))
 
 
 class FaultInjector:
@@ -81,6 +92,15 @@ class FaultInjector:
             "serial_loss": lambda mishap: self._fault(mishap, "unplug", _LOST_S),
             "brown_out": lambda mishap: self._fault(mishap, "brownout", _OFF_S),
         }
+        self._kinds: dict[str, Any] = {}
+        if twin.hardware.protocol == "feetech":
+            self._kinds = {"kinds": SERVO_FAULTS, "usual": USUAL}
+            self._doers |= {
+                "bus_silent": lambda mishap: self._fault(mishap, "silent", _LOST_S),
+                "servo_missing": lambda mishap: self._fault(mishap, "missing", _LOST_S, self._servo()),
+                "overload": lambda mishap: self._fault(mishap, "overload", _LOST_S, self._servo()),
+                "corrupt_replies": lambda mishap: self._fault(mishap, "corrupt", _LOST_S, _CORRUPT),
+            }
         self._all: list[InjectedFault] = []
         self._waiting: list[tuple[InjectedFault, int, float]] = []
         self._motions = 0
@@ -143,11 +163,15 @@ class FaultInjector:
         mishap.at_s = self.twin.clock.now_s()
         mishap.until_s = mishap.at_s + duration_s
 
-    def _fault(self, mishap: InjectedFault, kind: str, duration_s: float) -> None:
+    def _servo(self) -> float:
+        """The id of a joint's servo."""
+        return float(self._random.choice(next(iter(self.twin.hardware.arms.values())).channels))
+
+    def _fault(self, mishap: InjectedFault, kind: str, duration_s: float, amount: float | None = None) -> None:
         self._begins(mishap, duration_s)
         boards = tuple(self.twin.electronics.devices)
         board = boards[0] if len(boards) == 1 else str(self._random.choice(boards))
-        self.twin.add_faults([make_fault(kind, mishap.at_s, duration_s)], board)
+        self.twin.add_faults([make_fault(kind, mishap.at_s, duration_s, amount, **self._kinds)], board)
 
     def _freeze(self, mishap: InjectedFault) -> None:
         self._begins(mishap, _FROZEN_S)
@@ -161,7 +185,7 @@ class FaultInjector:
             return
         self._begins(mishap, _JAMMED_S)
         for wiring in twin.hardware.arms.values():
-            twin.add_faults([make_fault("jam", mishap.at_s, _JAMMED_S, wiring.gripper.channel)], wiring.board)
+            twin.add_faults([make_fault("jam", mishap.at_s, _JAMMED_S, wiring.gripper.channel, **self._kinds)], wiring.board)
 
     def _nudge(self, mishap: InjectedFault) -> None:
         """Somebody pushes the block, once it stands on the table and no hand is at it, nor where it comes to stand."""

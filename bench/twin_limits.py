@@ -14,6 +14,7 @@ from marl_handover.control.twin import Twin
 from marl_handover.hardware.clearance import FAR_MM, alone_mm, arm_shapes, between_mm, still
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.emulator.board import FRAME_S
+from marl_handover.hardware.settings import COUNTS_PER_RAD
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +31,7 @@ _OFF_US = 1.0
 class LimitWatch:
     """Counts every 20 ms in which something is outside its limits, and remembers the worst of each.
 
-    *Sent* is what the boards put out, read through the calibration that the host has; *true* is where the arms are. Speed and joints are
+    *Sent* is what boards put out, or bus servos tell, read through the host's calibration; *true* is where the arms are. All is
     judged while the servos are on: switched off, people turn them by hand.
     """
 
@@ -40,7 +41,8 @@ class LimitWatch:
         self._lower, self._upper = model.arm.lower_rad, model.arm.upper_rad
         self._shapes = arm_shapes(model)
         self._bases = [np.array([base.x_mm, base.y_mm, base.facing_rad]) for base in model.cell.bases]
-        self._pulses = [np.array(wiring.pulse_limits_us, float) for wiring in self._config.arms.values()]
+        self._pulses = [np.array(self._config.pulse_limits(name), float) for name in self._config.arms]
+        self._slack = 1.0 if self._config.protocol == "ssc32" else TRUE_RAD * COUNTS_PER_RAD
         self._before: Floats | None = None
         self.violations: Counter[str] = Counter()
         self.worst: dict[str, float] = {}
@@ -60,7 +62,7 @@ class LimitWatch:
     def _tick(self) -> None:
         now_s = self._twin.clock.now_s()
         self._twin.clock.at(now_s + FRAME_S, self._tick)
-        sent_us = self._sent_us(now_s)
+        sent_us = self._twin.electronics.told(now_s)
         on = (sent_us > _OFF_US).all(axis=1)
         if on.all():
             sent = np.array([it.to_rad(row) for it, row in zip(self._driver.calibrations, sent_us, strict=True)])
@@ -73,18 +75,14 @@ class LimitWatch:
             self._before = sent
         else:
             self._before = None
-
-    def _sent_us(self, now_s: float) -> Floats:
-        """(num_arms, 5)."""
-        outputs = {name: device.outputs_us(now_s) for name, device in self._twin.electronics.devices.items()}
-        return np.array([[outputs[wiring.board][channel] for channel in wiring.channels] for wiring in self._config.arms.values()])
+            self._twin.follower.collisions.clear()  # what falls or is turned by hand touches what it may
 
     def _joints(self, sent_us: Floats, sent: Floats, true: Floats) -> None:
         for row, limits in zip(sent_us, self._pulses, strict=True):
             self._over("sent pulse, us", float(np.maximum(limits[:, 0] - row, row - limits[:, 1]).max()), PULSE_US)
         rounding = np.array([[PULSE_US / servo.us_per_rad() for servo in it.maps] for it in self._driver.calibrations])
         beyond = np.maximum(self._lower - sent, sent - self._upper)
-        self._over("sent joint, rounded pulses", float((beyond / rounding).max()), 1.0)
+        self._over("sent joint, rounded pulses", float((beyond / rounding).max()), self._slack)
         self._over("true joint, rad", float(np.maximum(self._lower - true, true - self._upper).max()), TRUE_RAD)
 
     def _room(self, what: str, joints: Floats, table_mm: float, apart_mm: float) -> None:

@@ -45,11 +45,12 @@ from marl_handover.task.rules import Outcome, Rules
 HANG_WALL_S, HANG_VIRTUAL_S = 900.0, 600.0
 NOISES = (
     *(f"hardware.emulator.{name}" for name in ("dead_band_us", "dead_band_sd_us", "settle_sd_us", "scale_sd", "offset_sd_us")),
+    *(f"hardware.emulator.{name}" for name in ("bus_zero_deg", "bus_stiffness_share")),
     *(f"twin.{name}" for name in ("card_sd_mm", "card_sd_deg", "board_sd_mm", "board_sd_deg")),
     *("look.noise", "look.blur_px"),
 )
 SOAK_EVERY = 20
-_MOVE = re.compile(rb"#\d+P\d")
+_MOVE = re.compile(rb"#\d+P\d|\xff\xff\xfe.\x83\x2a", re.DOTALL)
 
 
 class Work(NamedTuple):

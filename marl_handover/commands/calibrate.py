@@ -67,7 +67,7 @@ def run(config: CalibrateCommand) -> int:
     if config.what in ("all", "camera", "servos"):
         devices = open_devices(config, model, config.motion, confirmed)
         try:
-            operator: Operator = devices.twin or TerminalOperator(config.hand_markers, tuple(devices.hardware.arms))
+            operator: Operator = devices.twin or TerminalOperator(config.hand_markers, model, tuple(devices.hardware.arms))
             if config.what in ("all", "camera"):
                 _camera(config, devices, operator)
             if config.what in ("all", "servos"):
@@ -113,9 +113,11 @@ def _camera(config: CalibrateCommand, devices: Devices, operator: Operator) -> N
 def _servos(config: CalibrateCommand, devices: Devices, operator: Operator, model: CellModel) -> None:
     from marl_handover.control.servo_calibration import ServoCalibration
     from marl_handover.control.workcell import camera_calibration
-    from marl_handover.hardware.calibration import save_servos
+    from marl_handover.files import make_folder
+    from marl_handover.hardware.calibration import lerobot_motors, save_servos
     from marl_handover.hardware.driver import ArmDriver
     from marl_handover.hardware.estop import StopLatch
+    from marl_handover.hardware.lerobot_file import write_motors
 
     seen_by = camera_calibration(config.folder())
     operator.glue_cards()
@@ -132,6 +134,9 @@ def _servos(config: CalibrateCommand, devices: Devices, operator: Operator, mode
                 f"{_sure(measured)}, {_change(driver.calibrations[arm], measured.calibration)}"
             )
             _require_good(name, measured, config.worst_mm)
+            if (spread := procedure.repeatability(arm)) is not None:
+                what = f"{spread.position_mm:.2f} mm and {spread.yaw_deg:.2f} degrees"
+                print(f"{name} arm: comes back to a posture within {what} (root mean square of {spread.visits} visits)")
     save_servos(
         config.folder(),
         {name: measured.calibration for name, measured in found.items()},
@@ -139,13 +144,19 @@ def _servos(config: CalibrateCommand, devices: Devices, operator: Operator, mode
         {name: measured.half_band_sd_us for name, measured in found.items()},
     )
     print(f"-> {config.folder()}")
+    for name, measured in found.items() if driver.config.protocol == "feetech" else ():
+        ids, closed = driver.config.channels(name), driver.config.arms[name].gripper.closed_us
+        path = config.folder() / "lerobot" / f"{name}.json"
+        make_folder(path.parent)
+        write_motors(path, lerobot_motors(measured.calibration, model.arm, ids, closed))
+        print(f"the {name} arm for LeRobot's own programs -> {path}")
     operator.take_cards_off()
 
 
 def _grippers(config: CalibrateCommand, model: CellModel) -> None:
     from marl_handover.control.calibration import Grip, GripperCalibration, TerminalOperator, confirmed, places
     from marl_handover.control.hardware_backend import HardwareBackend
-    from marl_handover.hardware.calibration import save_grippers
+    from marl_handover.hardware.gripper import save_grippers
     from marl_handover.motion.planner import MotionPlanner
 
     planner = MotionPlanner(model, config.motion)
@@ -154,7 +165,7 @@ def _grippers(config: CalibrateCommand, model: CellModel) -> None:
     names = tuple(backend.workcell.driver.config.arms)
     found: dict[str, Grip] = {}
     try:
-        operator: Operator = backend.workcell.twin or TerminalOperator(config.hand_markers, names)
+        operator: Operator = backend.workcell.twin or TerminalOperator(config.hand_markers, model, names)
         first = places(model.cell)[0]
         operator.stand_block(first)
         backend.reset(np.array(first), config.seed)
@@ -195,6 +206,8 @@ def _sure(measured: Measured) -> str:
 
 def _bands(measured: Measured) -> str:
     """The dead bands, each with the half-width of the interval it is in with 95 %."""
+    if not measured.half_band_us.any():
+        return "encoders take out dead bands"
     bands = zip(ARM_JOINTS, 2 * measured.half_band_us, 4 * measured.half_band_sd_us, strict=True)
     return "dead bands in us: " + " ".join(f"{joint} {width:.1f} +- {sure:.1f}" for joint, width, sure in bands)
 

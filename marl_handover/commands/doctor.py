@@ -166,20 +166,20 @@ def _ports(config: DoctorConfig) -> Iterator[str]:
     for port in ports:
         latency = latency_ms(port.path)
         timer = "" if latency is None else f", hands bytes over after {latency} ms"
-        kind = ", may be a controller" if port.likely else ""
+        kind = ", may be a controller" if port.likely else ", may be a bus of servos" if port.bus else ""
         yield f"{port.path}  {port.description}{kind}{timer}{_access(Path(port.path))}"
-        if config.ask and port.likely and port.path != config.port:
+        if config.ask and (port.likely or port.bus) and port.path != config.port:
             yield f"  {_who(port.path)}"
     if config.port:
         yield f"{config.port}: {_who(config.port)}"
-    elif any(port.likely for port in ports) and not config.ask:
+    elif any(port.likely or port.bus for port in ports) and not config.ask:
         yield "who is there, and at which rate: marl-handover doctor ask=true"
 
 
 def _who(port: str) -> str:
-    """What the controller at a port says that it is, or why it says nothing."""
+    """What the controller, or the bus servos, at a port say that they are, or why nobody says anything."""
     from marl_handover.hardware.clock import RealClock
-    from marl_handover.hardware.errors import DeviceError
+    from marl_handover.hardware.errors import BoardSilent, DeviceError
     from marl_handover.hardware.settings import BoardConfig, TimeoutConfig
     from marl_handover.hardware.ssc32 import Ssc32
 
@@ -188,10 +188,40 @@ def _who(port: str) -> str:
         firmware, best = board.connect().text, BoardConfig().baud
         slow = "" if board.wire.baud == best else f"; too slow to stop two arms in time: set the board to {best}, see docs/hardware.md"
         return f"{firmware} at {board.wire.baud} baud{slow}"
+    except BoardSilent as error:
+        return _servos(port) or f"{error}; nor do bus servos answer"
     except DeviceError as error:
         return str(error)
     finally:
         board.close()
+
+
+def _servos(port: str) -> str:
+    """What bus servos at a port say of themselves, as far as it matters for safety; empty if none answers at any rate."""
+    from marl_handover.hardware.clock import RealClock
+    from marl_handover.hardware.errors import DeviceError
+    from marl_handover.hardware.feetech import FeetechBus
+    from marl_handover.hardware.settings import SERVO_BAUDS, BoardConfig, TimeoutConfig
+
+    for baud in SERVO_BAUDS:
+        bus = FeetechBus("asked", BoardConfig(port, baud), TimeoutConfig(reply_s=0.02, retries=1), RealClock())
+        try:
+            bus.open([])
+            found = bus.scan()
+            if not found:
+                continue
+            names = ("model", "firmware", "present_voltage", "torque_enable", "lock", "return_delay")
+            said = []
+            for servo in found:
+                model, firmware, volts, torque, lock, delay = (bus.read(servo, name) for name in names)
+                state = f"torque {'on' if torque else 'off'}, lock {'shut' if lock else 'open'}, return delay {2 * delay} us"
+                said.append(f"{servo}: model {model}, firmware {firmware & 0xFF}.{firmware >> 8}, {volts / 10:g} V, {state}")
+            return f"bus servos at {baud} baud; " + "; ".join(said)
+        except DeviceError as error:
+            return str(error)
+        finally:
+            bus.close()
+    return ""
 
 
 def _arms() -> Iterator[str]:

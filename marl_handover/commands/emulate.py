@@ -104,12 +104,16 @@ def _boards(config: EmulateConfig) -> Mapping[str, SerialDevice]:
 
 
 def _buses(config: EmulateConfig) -> Mapping[str, SerialDevice]:
-    """Buses of servos that stand in the middle of their travel, limp."""
-    from marl_handover.hardware.emulator.servo_bus import emulated_buses, parse_servo_faults
+    """Buses of servos, limp, where a lab puts the arms before switching on."""
+    from marl_handover.cell.build import build_cell, cell_config
+    from marl_handover.config import MotionConfig
+    from marl_handover.hardware.emulator.servo_bus import EmulatedServoCell, parse_servo_faults
+    from marl_handover.motion.home import parked_poses
 
     faults = parse_servo_faults(config.faults)
-    buses = emulated_buses(config.hardware.for_arms())
-    for name, bus in buses.items():
+    model = build_cell(cell_config("so101"))
+    cell = EmulatedServoCell(config.hardware.for_arms(), model.arm, parked_poses(model, MotionConfig())[0])
+    for name, bus in cell.devices.items():
         if config.board in ("", name):
             bus.add_faults(faults)
-    return buses
+    return cell.devices

@@ -18,11 +18,14 @@ import numpy as np
 
 from marl_handover.arrays import Floats
 from marl_handover.cell import Cell
+from marl_handover.cell.build import CellModel
 from marl_handover.control.hardware_backend import BlockNotSeen, HardwareBackend
+from marl_handover.control.servo_calibration import card_place
 from marl_handover.control.settings import CardConfig
 from marl_handover.errors import WorkFailed
-from marl_handover.hardware.calibration import CalibrationProblem, shifted
+from marl_handover.hardware.calibration import CalibrationProblem
 from marl_handover.hardware.clock import Clock
+from marl_handover.hardware.gripper import shifted
 from marl_handover.hardware.settings import ARMS, GripperConfig
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.perception.calibration import CameraCalibration, Pixels, calibrate_lens
@@ -91,8 +94,8 @@ def laid_anew() -> None:
 class TerminalOperator:
     """A person at a terminal, who is told what to do and presses Enter when it is done."""
 
-    def __init__(self, cards: CardConfig, arms: Sequence[str] = ARMS) -> None:
-        self._cards, self._arms = cards, arms
+    def __init__(self, cards: CardConfig, model: CellModel, arms: Sequence[str] = ARMS) -> None:
+        self._cards, self._arms, self._place_mm = cards, arms, card_place(model.arm, cards)
 
     def hold_board(self, sheet: Sheet, number: int, count: int) -> None:
         """See the protocol."""
@@ -113,7 +116,7 @@ class TerminalOperator:
 
     def glue_cards(self) -> None:
         """See the protocol."""
-        x, y, z = self._cards.place_mm
+        x, y, z = self._place_mm
         (first, marker), *others = zip(self._arms, self._cards.numbers(len(self._arms)), strict=True)
         where = "".join(f", {number} on the {arm} one" for arm, number in others)
         _wait(
@@ -216,17 +219,18 @@ class GripperCalibration:
         """
         name = self._names[arm]
         wiring = self.backend.workcell.driver.config.arms[name]
-        asked = self.backend.workcell.config.hardware.arms[name].gripper
+        asked, unit = self.backend.workcell.config.hardware.arms[name].gripper, self.backend.workcell.driver.config.unit
+        jaw = None if unit.name == "us" else self.backend.workcell.driver.wiring.gripper(name).closing_per_mm
         tries = np.arange(-RANGE_MM, RANGE_MM + STEP_MM / 2, STEP_MM)
         for number, further_mm in enumerate(tries, start=1):
-            wiring.gripper = shifted(asked, float(further_mm))
+            wiring.gripper = shifted(asked, float(further_mm), jaw, unit)
             held = self._carries(arm)
             self.progress(arm, float(further_mm), held)
             if held and number == 1:
                 raise CalibrationProblem(f"the {name} gripper", self._words(asked, f"it holds the pin {RANGE_MM:g} mm too early"))
             if held:
                 off_mm = float(further_mm) + SURE_MM
-                wiring.gripper = shifted(asked, off_mm)
+                wiring.gripper = shifted(asked, off_mm, jaw, unit)
                 return Grip(wiring.gripper, off_mm, number)
         raise CalibrationProblem(f"the {name} gripper", self._words(asked, f"it does not hold the pin, {RANGE_MM:g} mm further"))
 

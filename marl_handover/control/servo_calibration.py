@@ -21,7 +21,9 @@ from scipy.optimize import least_squares
 from marl_handover.arrays import Floats, wrap
 from marl_handover.cell.build import CellModel
 from marl_handover.control.settings import CardConfig
-from marl_handover.geometry.se3 import transform
+from marl_handover.geometry.arm_model import ArmModel
+from marl_handover.geometry.capsules import joints_before
+from marl_handover.geometry.se3 import apply, transform
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.calibration import ArmCalibration, CalibrationProblem, ServoMap
 from marl_handover.hardware.driver import ArmDriver
@@ -30,6 +32,7 @@ from marl_handover.hardware.settings import ARMS
 from marl_handover.perception.calibration import CameraCalibration, Pixels
 from marl_handover.perception.camera import Camera
 from marl_handover.perception.detector import MarkerFinder
+from marl_handover.perception.scene import outline
 from marl_handover.perception.settings import TargetConfig
 
 LEAST_SIGHTINGS = 8
@@ -38,6 +41,39 @@ WORST_MM = 5.0
 
 _USUAL_US, _ARM_SD_US, _JOINT_SD_US = 4.0, 3.0, 1.5
 """Half the dead band of a hobby servo; how far an arm's servos may be from that together, and each from the arm's others."""
+
+
+_CARD_MM = 0.2
+"""Thickness of a card."""
+
+
+def T_grip_hand(arm: ArmModel) -> Floats:
+    """The hand's frame (4, 4) in the grip's: x along the roll axis, as the fingers are. A grip is level where it picks; a hand may tilt."""
+    turned = np.array([0.0, 0.0, 0.0, 0.0, 0.5])
+    R = arm.fk(np.zeros(5))[:3, :3].T @ arm.fk(turned)[:3, :3]
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    axis *= np.sign(axis[0]) or 1.0
+    return transform((0.0, 0.0, 0.0), (0.0, math.atan2(-float(axis[2]), float(axis[0])), 0.0))
+
+
+def card_place(arm: ArmModel, cards: CardConfig) -> Floats:
+    """Where the middle of a hand's marker card is (3,), in mm in the hand's frame: as the settings say, else flat on the palm.
+
+    The palm is the largest of the hand's shapes, fingers apart.
+    """
+    if cards.place_mm is not None:
+        return np.asarray(cards.place_mm, float)
+    frames, levels = arm.link_transforms(np.zeros(5)), joints_before(arm.description)
+    T_hand_root = np.linalg.inv(arm.fk(np.zeros(5)) @ T_grip_hand(arm))
+    fingers = {arm.description.joint(name).child for name in arm.description.gripper.joints}
+    boxes = []
+    for link in arm.description.links:
+        if levels[link.name] == len(ARM_JOINTS) and link.name not in fingers:
+            for shape in link.collisions:
+                corners = apply(T_hand_root @ frames[link.name] @ transform(shape.xyz_mm, shape.rpy_rad), outline(shape))
+                boxes.append((corners.min(axis=0), corners.max(axis=0)))
+    low, high = max(boxes, key=lambda box: float(np.prod(box[1] - box[0])))
+    return np.array([(low[0] + high[0]) / 2, 0.0, high[2] + _CARD_MM])
 
 
 class Unexplained(CalibrationProblem):
@@ -175,18 +211,23 @@ def _misses(model: CellModel, arm: int, joints_rad: Floats, sightings: Sequence[
 
 
 POSTURES = 40
-_DRAWN = 60_000
+VISITS = 12
+"""How often a posture is gone to, to see how far it is from itself."""
+_DRAWN = 200_000
 _SIDE_RAD = math.radians(4.0)
 _SPEED_DEG_S = 40.0
 _SETTLE_S = 0.4
-_LOW = np.radians([-60.0, 30.0, -160.0, -70.0, -35.0])
-_HIGH = np.radians([60.0, 125.0, -114.0, 90.0, 35.0])
-_HEIGHT_MM, _RADIUS_MM = (65.0, 190.0), (130.0, 205.0)
+_OUTER_RAD = np.radians([60.0, math.inf, math.inf, math.inf, 35.0])
+"""How far joints are turned at most, either way: so that the camera sees the card."""
+_ABOVE_MM, _WITHIN = (20.0, 145.0), (0.87, 0.89)
+"""How high over where it picks a grip is, and how far out: shares of the ring's inner and outer radius."""
 _FACING_UP = math.cos(math.radians(40.0))
 _MARGIN_PX = 60.0
 _SIGHT_SD_MM, _YAW_SD_DEG = 0.6, 1.0
 _TYPICAL_HEIGHT_MM = 110.0
 _OPENING_PX = 3
+_ENCODER_SD = 1e-4
+"""Scales of encoders are known, but for rounding."""
 
 
 class Posture(NamedTuple):
@@ -209,6 +250,14 @@ class Measured(NamedTuple):
     residual_mm: float
     sightings: int
     joint_sd_deg: Floats
+
+
+class Repeatability(NamedTuple):
+    """How far a hand was from its mean place when it came to one posture again and again: root mean squares, as the camera saw them."""
+
+    position_mm: float
+    yaw_deg: float
+    visits: int
 
 
 class ServoCalibration:
@@ -240,14 +289,16 @@ class ServoCalibration:
         self._random = np.random.default_rng(seed)
         edge_px = cards.marker_mm * seen_by.px_per_mm(_TYPICAL_HEIGHT_MM)
         self._finder = MarkerFinder(target.dictionary, edge_px, _OPENING_PX)
-        self._corners_mm = np.asarray(cards.place_mm) + cards.marker_mm / 2 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+        arm, half_mm = driver.model.arm, cards.marker_mm / 2
+        self._T_grip_card = T_grip_hand(arm) @ transform(tuple(card_place(arm, cards)), (0.0, 0.0, 0.0))
+        self._corners_mm = apply(self._T_grip_card, half_mm * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]))
 
     def arm(self, arm: int) -> Measured:
         """Calibrate one arm and park it again.
 
         Raises:
             CalibrationProblem: the marker was seen too seldom, or no servo explains what was seen.
-            CommandRejected, Stopped, BoardReset, PortLost, BadReply: as :meth:`ArmDriver.move`.
+            CommandRejected, Stopped, ArmingLost, ConnectionLost, BadReply: as :meth:`ArmDriver.move`.
         """
         sightings: list[MarkerObservation] = []
         for posture in self._postures(arm):
@@ -260,37 +311,84 @@ class ServoCalibration:
             )
         before = self.driver.calibrations[arm]
         sure = {"position_sd_mm": _SIGHT_SD_MM, "yaw_sd_deg": _YAW_SD_DEG}
+        if self._encoders(arm):
+            sure["scale_sd"] = _ENCODER_SD
         found = solve_calibration(self.driver.model, before, sightings, arm=arm, **sure)
         seen = len(sightings) // 4
-        return Measured(found.calibration, found.half_band_us, found.half_band_sd_us, found.residual_mm, seen, found.joint_sd_deg)
+        if self._encoders(arm):  # what a servo rests short of is read, and taken out as it is driven
+            found = found._replace(half_band_us=np.zeros(5), half_band_sd_us=np.zeros(5))
+        calibration = replace(found.calibration, homing_offsets=self.driver.boards.marks(self.driver.config)[arm])
+        return Measured(calibration, found.half_band_us, found.half_band_sd_us, found.residual_mm, seen, found.joint_sd_deg)
+
+    def repeatability(self, arm: int, visits: int = VISITS) -> Repeatability | None:
+        """Go to one posture from others on all sides, and see where the marker is every time; None if it is not seen twice.
+
+        Raises as :meth:`arm`.
+        """
+        postures, T_world_base, seen = self._postures(arm), self.driver.model.cell.bases[arm].matrix(), []
+        if len(postures) < 2:
+            return None
+        target = postures[len(postures) // 2]
+        height_mm = float((T_world_base @ self.driver.model.arm.fk(target.joints_rad) @ self._T_grip_card)[2, 3])
+        for visit in range(visits):
+            away = postures[visit % len(postures)]
+            for posture in (away, Posture(target.joints_rad, away.side)):
+                found = self._marker(arm, posture)
+            if found is not None:
+                seen.append(self.seen_by.on_plane(found, height_mm))
+        self.driver.drive(arm, self.driver.parked_rad, self.driver.gripper_mm(arm), _SPEED_DEG_S)
+        if len(seen) < 2:
+            return None
+        corners = np.array(seen)
+        middles, edges = corners.mean(axis=1), corners[:, 1] - corners[:, 0]
+        yaws = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
+        spread_mm = float(np.sqrt(((middles - middles.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        return Repeatability(spread_mm, math.degrees(float(yaws.std())), len(seen))
 
     def _sight(self, arm: int, posture: Posture) -> list[MarkerObservation]:
         """The four corners of the marker at a posture; none if it is not seen."""
-        fingers = self.driver.gripper_mm(arm)
+        found = self._marker(arm, posture)
+        if found is None:
+            return []
+        pulses = self._pulses(arm, JointCommand(arm, posture.joints_rad, self.driver.gripper_mm(arm)))
+        camera_mm = _triple(self.seen_by.eye_mm())
+        way = np.sign([float(servo.to_us(1.0)) - float(servo.to_us(0.0)) for servo in self.driver.calibrations[arm].maps])
+        came = tuple((0.0 * way if self._encoders(arm) else posture.side * way).tolist())
+        return [
+            MarkerObservation(pulses, at, camera_mm=camera_mm, plane_mm=0.0, point_mm=_triple(corner), came=came)
+            for at, corner in zip(self.seen_by.on_plane(found, 0.0), self._corners_mm, strict=True)
+        ]
+
+    def _marker(self, arm: int, posture: Posture) -> Floats | None:
+        """Pixels (4, 2) of the marker's corners once the hand is at a posture; None if it may not go there, or is not seen."""
+        fingers, number = self.driver.gripper_mm(arm), self._markers[arm]
         try:
             for joints in (posture.joints_rad - posture.side * _SIDE_RAD, posture.joints_rad):
                 self.driver.drive(arm, joints, fingers, _SPEED_DEG_S)
         except CommandRejected:
-            return []
-        self.driver.wait(_SETTLE_S)
-        wiring = self.driver.config.arms[self._names[arm]]
-        sent = self.driver.wiring.pulses([JointCommand(arm, posture.joints_rad, fingers)])[wiring.board]
-        pulses = np.array([sent[channel] for channel in wiring.channels], float)
-        number = self._markers[arm]
+            return None
+        self.driver.settle(_SETTLE_S)
         found = self._finder.find(_grey(self.camera.read().image), [number]).get(number)
-        if found is None:
-            return []
-        camera_mm = _triple(self.seen_by.eye_mm())
-        way = np.sign([float(servo.to_us(1.0)) - float(servo.to_us(0.0)) for servo in self.driver.calibrations[arm].maps])
-        came = tuple((posture.side * way).tolist())
-        return [
-            MarkerObservation(pulses, at, camera_mm=camera_mm, plane_mm=0.0, point_mm=_triple(corner), came=came)
-            for at, corner in zip(self.seen_by.on_plane(found.pixels, 0.0), self._corners_mm, strict=True)
-        ]
+        return None if found is None else found.pixels
+
+    def _encoders(self, arm: int) -> bool:
+        """Whether an arm's servos tell where they stand."""
+        return self.driver.boards.by_name[self.driver.config.arms[self._names[arm]].board].has_encoders
+
+    def _pulses(self, arm: int, command: JointCommand) -> Floats:
+        """Pulses (5,) of the joints: where encoders say that they stand, else as they were sent."""
+        wiring = self.driver.config.arms[self._names[arm]]
+        if self._encoders(arm):
+            told = self.driver.boards.by_name[wiring.board].pulses(wiring.channels)
+            return np.array([math.nan if told[channel] is None else told[channel] for channel in wiring.channels], float)
+        sent = self.driver.wiring.pulses([command])[wiring.board]
+        return np.array([sent[channel] for channel in wiring.channels], float)
 
     def _postures(self, arm: int) -> list[Posture]:
         """Postures over the table in which the marker can be seen, in an order in which neighbours are near each other."""
-        q = self._random.uniform(_LOW, _HIGH, (_DRAWN, 5))
+        limits = self.driver.model.arm
+        low, high = np.maximum(limits.lower_rad, -_OUTER_RAD), np.minimum(limits.upper_rad, _OUTER_RAD)
+        q = self._random.uniform(low, high, (_DRAWN, 5))
         q = q[self._suitable(arm, q)]
         side = self._random.choice([-1.0, 1.0], (len(q), 5))
         chosen: list[Posture] = []
@@ -307,8 +405,10 @@ class ServoCalibration:
         limits = model.arm.within_limits(q - _SIDE_RAD) & model.arm.within_limits(q + _SIDE_RAD)
         grip = model.arm.fk(q)
         radius = np.hypot(grip[:, 0, 3], grip[:, 1, 3])
-        room = (grip[:, 2, 3] > _HEIGHT_MM[0]) & (grip[:, 2, 3] < _HEIGHT_MM[1]) & (radius > _RADIUS_MM[0]) & (radius < _RADIUS_MM[1])
-        card = base.matrix() @ grip @ transform(tuple(self.cards.place_mm), (0.0, 0.0, 0.0))
+        ring, above = model.cell.arms[arm], grip[:, 2, 3] - model.cell.pick_heights_mm[arm]
+        room = (above > _ABOVE_MM[0]) & (above < _ABOVE_MM[1])
+        room &= (radius > _WITHIN[0] * ring.r_min_mm) & (radius < _WITHIN[1] * ring.r_max_mm)
+        card = base.matrix() @ grip @ self._T_grip_card
         away = self.seen_by.eye_mm() - card[:, :3, 3]
         facing = np.einsum("ni,ni->n", card[:, :3, 2], away) / np.linalg.norm(away, axis=1) > _FACING_UP
         pixels = self.seen_by.project(card[:, :3, 3])

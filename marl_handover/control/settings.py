@@ -68,11 +68,11 @@ class TwinConfig:
 
 @dataclass
 class CardConfig:
-    """The printed markers that are glued onto the hands while servos are calibrated: which, how large, and where in the grip's frame."""
+    """The printed markers that are glued onto the hands while servos are calibrated: which, how large, and where."""
 
     ids: list[int] | None = bounded(None, 0, 10_000, (1, 32))  # of target.dictionary, one an arm, in order; null: 2, 3 and so on
     marker_mm: float = bounded(30.0, 4.0, 200.0)
-    place_mm: list[float] = bounded([-47.0, 0.0, 13.2], -500.0, 500.0, (3, 3))  # its middle: flat on the hand, x along the fingers
+    place_mm: list[float] | None = bounded(None, -500.0, 500.0, (3, 3))  # its middle from the grip, x along the fingers; null: on the palm
 
     def numbers(self, arms: int) -> list[int]:
         """The markers of so many arms."""

@@ -22,12 +22,14 @@ from marl_handover.errors import InvalidSetting
 from marl_handover.hardware.connection import State
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.errors import (
+    ArmingLost,
     BadReply,
-    BoardReset,
+    ConnectionLost,
     DeviceError,
     NotConfirmed,
-    PortLost,
     PulseMismatch,
+    ServoAstray,
+    ServoFault,
     Stalled,
     Stopped,
     WrongState,
@@ -81,7 +83,7 @@ def stream(
     Raises:
         InvalidSetting: a motion does not begin where its arm is.
         Stalled: the host fell behind by more than ``stream.late_s``; the arms hold.
-        CommandRejected, Stopped, PulseMismatch, BoardReset, PortLost, BadReply: as :meth:`ArmDriver.move`.
+        CommandRejected, Stopped, PulseMismatch, ArmingLost, ConnectionLost, BadReply: as :meth:`ArmDriver.move`.
     """
     settings, clock = driver.config.stream, driver.clock
     tracks = [_track(driver, arm, phases) for arm, phases in motions.items() if phases]
@@ -246,11 +248,12 @@ class TrajectoryPlayer:
     def _play(self, arm: int, phases: Sequence[Phase], called_off: Callable[[float], bool] | None) -> bool:
         try:
             self._ready()
-        except (BoardReset, PortLost):
+        except (ArmingLost, ConnectionLost):
             return self._start_over()
         aimed = self.backlash.compensated(arm, phases)
         self.reached_s = float(aimed[0].t_s[0])
         rest: Sequence[Phase] = aimed
+        held_once = False
         for _ in range(_RESUMED):
             try:
                 turned = stream(self.driver, {arm: rest}, on_tick=self._tick, called_off=self._turning(aimed, called_off))
@@ -258,12 +261,20 @@ class TrajectoryPlayer:
                     return self._turn_back(arm, aimed[0])
                 self.backlash.note_reached(arm, phases[-1].joints_rad[-1], aimed[-1].joints_rad[-1])
                 return True
+            except ServoAstray as failure:
+                if held_once:
+                    raise
+                held_once = True
+                self.log.add(Event.PULSE_MISMATCH, text=failure)
+                self.driver.wait(_RETRY_S)
+                self.driver.resume()
             except _FINAL:
                 raise
-            except BoardReset as failure:
+            except ArmingLost as failure:
                 self.log.add(Event.CONTROLLER_RESET, text=failure)
-                return self._start_over()
-            except PortLost as failure:
+                if not (isinstance(failure, ServoFault) and self._resynced()):
+                    return self._start_over()
+            except ConnectionLost as failure:
                 self.log.add(Event.SERIAL_LOST, text=failure)
                 if not self._reconnect():
                     return self._start_over()
@@ -328,12 +339,18 @@ class TrajectoryPlayer:
         """
         begun_s = self.workcell.clock.now_s()
         self.driver.reconnect()
-        try:
-            self.driver.resync()
-        except (BoardReset, BadReply, PortLost, CommandRejected):
+        if not self._resynced():
             self.log.add(Event.CONTROLLER_RESET, text="after the port was lost")
             return False
         self.log.add(Event.RECOVERED, what=Event.SERIAL_LOST, after_s=self.workcell.clock.now_s() - begun_s)
+        return True
+
+    def _resynced(self) -> bool:
+        """Whether the arms could be taken where they are held, for the motion to go on from there. An overload that passes ends with it."""
+        try:
+            self.driver.resync()
+        except (ArmingLost, BadReply, ConnectionLost, CommandRejected):
+            return False
         return True
 
     def _start_over(self) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,12 +16,14 @@ from numpy.typing import ArrayLike
 from marl_handover.arrays import Floats
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
+from marl_handover.control.servo_calibration import T_grip_hand, card_place
 from marl_handover.control.settings import WorkcellConfig
 from marl_handover.errors import InvalidSetting
 from marl_handover.geometry.arm_model import Bools
 from marl_handover.geometry.se3 import flat_pose, transform
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.emulator.device import EmulatedCell, Fault
+from marl_handover.hardware.emulator.servo_bus import EmulatedServoCell
 from marl_handover.motion.home import parked_poses
 from marl_handover.perception.calibration import Pixels, hung_camera
 from marl_handover.perception.camera import Frame, RenderedCamera
@@ -28,6 +31,7 @@ from marl_handover.perception.printables import Sheet, marker_sheet
 from marl_handover.perception.scene import CellPainter, held_boards
 from marl_handover.perception.settings import USUAL_EYE_MM, CameraConfig, MountConfig
 from marl_handover.simulation.arm import SERVO_S
+from marl_handover.simulation.effort import holding_n_m
 from marl_handover.simulation.follower import ServoFollower, ServoState
 from marl_handover.simulation.world import SimulatedCell
 
@@ -97,7 +101,12 @@ class Twin:
         self.clock = VirtualClock()
         self._parked = parked_poses(model, motion)[0]
         wired = config.hardware.for_arms(model.cell.names)
-        self.electronics = EmulatedCell(wired, model.arm, self._parked, motion.finger_travel_mm)
+        self.electronics: EmulatedCell | EmulatedServoCell
+        if wired.protocol == "ssc32":
+            self.electronics = EmulatedCell(wired, model.arm, self._parked, motion.finger_travel_mm)
+        else:
+            weight = partial(holding_n_m, model.arm)
+            self.electronics = EmulatedServoCell(wired, model.arm, self._parked, motion.finger_travel_mm, weight)
         ports = self.electronics.mount(self.clock)
         self.hardware = replace(
             wired,
@@ -162,14 +171,13 @@ class Twin:
     def confirm(self, question: str) -> bool:
         """The twin's operator: does what is asked, and says so.
 
-        Whoever is asked whether the arms stand parked puts them there: opens the hand, sets the block down, turns the joints by hand. While
-        the boards hold the arms there is nothing to do.
+        Whoever is asked whether the arms stand parked puts those there that are limp: opens the hand, sets the block down, turns the joints
+        by hand. For arms that are held there is nothing to do.
         """
         now_s = self.clock.now_s()
-        if any(any(device.outputs_us(now_s)) for device in self.electronics.devices.values()):
-            return True
-        if np.abs(self.electronics.joints_rad(now_s) - self._parked).max() > math.radians(2.0):
-            self._tidy_up()
+        limp = self.electronics.limp_arms(now_s)
+        if limp and np.abs(self.electronics.joints_rad(now_s)[limp] - self._parked).max() > math.radians(2.0):
+            self._tidy_up(limp)
         return True
 
     def hold_board(self, sheet: Sheet, number: int, count: int) -> None:
@@ -193,9 +201,9 @@ class Twin:
         self._cards = []
         for number in cards.numbers(self.model.cell.num_arms):
             off = self._random.normal(size=3) * (people.card_sd_mm, people.card_sd_mm, math.radians(people.card_sd_deg))
-            place = np.asarray(cards.place_mm) + (off[0], off[1], 0.0)
+            place = card_place(self.model.arm, cards) + (off[0], off[1], 0.0)
             sheet = marker_sheet(self.config.target.dictionary, number, cards.marker_mm, cards.marker_mm * 4 / 3)
-            self._cards.append((sheet, transform(tuple(place), (0.0, 0.0, float(off[2])))))
+            self._cards.append((sheet, T_grip_hand(self.model.arm) @ transform(tuple(place), (0.0, 0.0, float(off[2])))))
 
     def take_cards_off(self) -> None:
         """The hands are free."""
@@ -233,11 +241,10 @@ class Twin:
         block = None if now_s < self.hidden_until_s or self._sheets else self.cell.block.transform()
         return painter.picture(block, joints, self.goal, fingers, sheets)
 
-    def _tidy_up(self) -> None:
-        """Open the hands, set the block down, turn the arms to the parked pose: raised first, then the rest."""
-        arms = range(self.model.cell.num_arms)
+    def _tidy_up(self, arms: Sequence[int]) -> None:
+        """Open the hands, set the block down, turn ``arms`` to the parked pose: raised first, then the rest."""
         for arm in arms:
-            self.electronics.servos(arm)[-1].put(self.motion.finger_travel_mm)
+            self.electronics.put_hand(arm, self.motion.finger_travel_mm, self.clock.now_s())
         self.clock.sleep_s(_HAND_S)
         pose = self.true_pose()
         if self.cell.block.height_mm() > _LIFTED_MM or self.cell.tilt_rad() > _LEANING_RAD or not self.model.cell.reaches(pose[:2]).any():

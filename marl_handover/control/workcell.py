@@ -25,11 +25,11 @@ from marl_handover.hardware.calibration import (
     load_backlash,
     require_one_set,
     servo_files,
-    with_grippers,
 )
 from marl_handover.hardware.clock import Clock, RealClock
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.estop import StopLatch
+from marl_handover.hardware.gripper import with_grippers
 from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.perception.calibration import CameraCalibration
 from marl_handover.perception.camera import Camera, open_camera
@@ -87,7 +87,6 @@ def open_devices(config: WorkcellConfig, model: CellModel, motion: MotionConfig,
         InvalidSetting, UnknownChoice: a setting is out of its limits, or an arm of the cell is not wired.
         NoCamera: the camera is not there.
     """
-    config.hardware.require_boards()
     config.validate(model.cell.names)
     if config.emulated:
         twin = Twin(model, motion, config)
@@ -114,7 +113,6 @@ def open_workcell(
         NoCamera: the camera is not there.
         InvalidSetting, UnknownChoice: a setting is out of its limits, or an arm of the cell is not wired.
     """
-    config.hardware.require_boards()
     wired = config.hardware.for_arms(model.cell.names)
     folder = config.folder()
     seen_by = camera_calibration(folder)

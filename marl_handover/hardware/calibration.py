@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,8 @@ from marl_handover.errors import CorruptFile, HandoverError, MissingFile, Unsupp
 from marl_handover.files import keep, make_folder, read_bounded, write_together, write_whole
 from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.urdf import ARM_JOINTS
-from marl_handover.hardware.settings import ARMS, PULSE_US, GripperConfig, HardwareConfig
+from marl_handover.hardware.lerobot_file import Motor, read_motors
+from marl_handover.hardware.settings import ARMS, COUNTS, COUNTS_PER_RAD, HardwareConfig
 from marl_handover.parsing import JSON_BYTES, read_json
 
 VERSION = 1
@@ -38,6 +39,9 @@ RESIDUAL_LIMIT_DEG = 4.0
 
 BACKLASH_VERSION = 2
 BACKLASH_FILE = "play.json"
+_HANDS = {"ssc32": ("fingers", 2, "two fingers that slide"), "feetech": ("jaw", 1, "a jaw that turns")}
+"""Of what speaks each protocol: kind, joints and words of the hand that it has servos for."""
+
 _SERVOS_AGAIN = "run: marl-handover calibrate what=servos hardware=NAME, with the name you run"
 MOST_US = 20.0
 
@@ -45,12 +49,6 @@ SET_FILE = "servos.json"
 """Names the others' content, so that files of two calibrations are told from those of one."""
 
 _SET_VERSION = 1
-
-GRIPPERS_FILE = "grippers.json"
-_GRIPPERS_VERSION = 1
-_GRIPPERS_FOUND = ("open_us", "closed_us")
-_GRIPPERS_ASKED = (*_GRIPPERS_FOUND, "open_mm")
-_GRIPPERS_AGAIN = "run: marl-handover calibrate what=grippers hardware=NAME, with the name you run"
 
 
 class CalibrationProblem(HandoverError):
@@ -123,13 +121,17 @@ class ServoMap:
 
 @dataclass(frozen=True)
 class ArmCalibration:
-    """The five servo maps of one arm. ``measured_unix_s`` is 0 for nominal ones, that nobody has measured."""
+    """The five servo maps of one arm. ``measured_unix_s`` is 0 for nominal ones, that nobody has measured.
+
+    ``homing_offsets`` are those that the arm's bus servos keep, the hand's last: they tell it from other arms. Boards' servos have none.
+    """
 
     arm: str
     robot: str
     maps: tuple[ServoMap, ...]
     limits_rad: tuple[tuple[float, float], ...]
     measured_unix_s: float = 0.0
+    homing_offsets: tuple[int, ...] = ()
 
     def to_us(self, joints_rad: ArrayLike) -> Floats:
         """Pulses (..., 5) of joint vectors (..., 5)."""
@@ -163,7 +165,8 @@ class ArmCalibration:
         }
         limits = {name: list(pair) for name, pair in zip(ARM_JOINTS, self.limits_rad, strict=True)}
         head = {"version": VERSION, "arm": self.arm, "robot": self.robot, "measured_unix_s": self.measured_unix_s}
-        return {**head, "limits_rad": limits, "joints": joints}
+        kept = {"homing_offsets": list(self.homing_offsets)} if self.homing_offsets else {}
+        return {**head, **kept, "limits_rad": limits, "joints": joints}
 
 
 def make_calibration(arm: str, model: ArmModel, points: Mapping[str, Sequence[tuple[float, float]]], fit: str = "line") -> ArmCalibration:
@@ -174,8 +177,19 @@ def make_calibration(arm: str, model: ArmModel, points: Mapping[str, Sequence[tu
 
 
 def nominal_calibration(config: HardwareConfig, arm: str, model: ArmModel) -> ArmCalibration:
-    """What an arm is taken for before anything was measured."""
+    """What an arm is taken for before anything was measured: as the settings say; bus servos have the URDF's zeros in the middle."""
     maps = []
+    if config.protocol == "feetech":
+        path = config.arms[arm].lerobot
+        motors = read_motors(Path(path)) if path else None
+        zeros = [COUNTS / 2] * len(ARM_JOINTS) if motors is None else [motor.middle for motor in motors]
+        homing = () if motors is None else tuple(motor.homing_offset for motor in motors)
+        for joint, source, zero in zip(ARM_JOINTS, model.description.sources, zeros, strict=False):
+            middle = -source.sign * source.offset_rad  # the joint's angle where the URDF's is 0
+            quarter = COUNTS / 4 * source.sign
+            points = [(zero - quarter, middle - math.pi / 2), (zero + quarter, middle + math.pi / 2)]
+            maps.append(ServoMap(f"{arm} {joint}", points))
+        return ArmCalibration(arm, model.description.name, tuple(maps), _limits(model), homing_offsets=homing)
     for joint in ARM_JOINTS:
         servo = config.nominal[joint]
         points = [(servo.zero_us + servo.us_per_deg * degrees, math.radians(degrees)) for degrees in (-90.0, 90.0)]
@@ -193,7 +207,7 @@ def load_calibration(path: Path | str, arm: str, model: ArmModel) -> ArmCalibrat
     path = Path(path)
     if not path.is_file():
         raise MissingFile("servo calibration", path, "run: marl-handover calibrate")
-    with _stored("servo calibration", path, VERSION) as content:
+    with stored("servo calibration", path, VERSION) as content:
         owner = (content["arm"], content["robot"])
         limits = {name: tuple(float(value) for value in pair) for name, pair in content["limits_rad"].items()}
         points = {
@@ -201,6 +215,7 @@ def load_calibration(path: Path | str, arm: str, model: ArmModel) -> ArmCalibrat
             for name, entry in content["joints"].items()
         }
         measured = float(content["measured_unix_s"])
+        homing = tuple(int(offset) for offset in content.get("homing_offsets", ()))
     if owner != (arm, model.description.name):
         raise CalibrationProblem(str(path), f"it is of arm {owner[0]!r}, robot {owner[1]!r}; wanted {arm!r}, {model.description.name!r}")
     _require_joints(arm, points)
@@ -210,11 +225,30 @@ def load_calibration(path: Path | str, arm: str, model: ArmModel) -> ArmCalibrat
             now, then = np.degrees(pair).round(1).tolist(), np.degrees(limits[joint]).round(1).tolist()
             raise CalibrationProblem(str(path), f"{joint} was calibrated with limits {then} degrees, the URDF has {now}: calibrate again")
     maps = tuple(ServoMap(f"{arm} {joint}", points[joint][1], points[joint][0]) for joint in ARM_JOINTS)
-    return ArmCalibration(arm, model.description.name, maps, _limits(model), measured)
+    return ArmCalibration(arm, model.description.name, maps, _limits(model), measured, homing)
+
+
+def require_own_arms(calibrations: Sequence[ArmCalibration], marks: Sequence[tuple[int, ...]]) -> None:
+    """See that every arm is the one that was calibrated, by the homing offsets that its servos keep, ``marks`` of the arms in order.
+
+    Raises :class:`CalibrationProblem` for arms that are swapped, and for one that was calibrated with other servos or other offsets.
+    """
+    for calibration, kept in zip(calibrations, marks, strict=True):
+        if not calibration.homing_offsets or calibration.homing_offsets == kept:
+            continue
+        other = next((other.arm for other in calibrations if other.homing_offsets == kept), None)
+        if other is not None:
+            raise CalibrationProblem(
+                f"the {calibration.arm} arm", f"the arm at its port is the {other} one: swap the two USB cables, or ports"
+            )
+        reason = f"its servos keep homing offsets {list(kept)}, it was calibrated with {list(calibration.homing_offsets)}"
+        raise CalibrationProblem(
+            f"the {calibration.arm} arm", f"{reason}: another arm, or calibrated since by another program; {_SERVOS_AGAIN}"
+        )
 
 
 @contextmanager
-def _stored(what: str, path: Path, version: int, again: str = "") -> Iterator[dict[str, Any]]:
+def stored(what: str, path: Path, version: int, again: str = "") -> Iterator[dict[str, Any]]:
     """What a file of that version holds. Raises :class:`CorruptFile` for another one, and for whatever is missed in it within the block."""
     try:
         content = read_json(path, what)
@@ -232,15 +266,35 @@ def calibrations(config: HardwareConfig, model: ArmModel) -> tuple[ArmCalibratio
         UnsupportedKinematics: the arm has other joints or another hand than the servos are wired for.
     """
     description = model.description
-    servos = [source.joint for source in description.sources]
-    if None in servos or description.gripper.kind != "fingers" or len(description.gripper.joints) != 2:
-        missing = "the joint wrist_roll" if None in servos else "a hand with two fingers that slide"
-        problem = f"hardware and twin have servos for five joints and two fingers, but this robot lacks {missing}; use backend=bullet"
-        raise UnsupportedKinematics(description.path, problem)
+    servos, hand = [source.joint for source in description.sources], description.gripper
+    kind, count, words = _HANDS[config.protocol]
+    if None in servos or hand.kind != kind or len(hand.joints) != count:
+        missing = "the joint wrist_roll" if None in servos else f"a hand with {words}"
+        problem = f"hardware {config.name!r} has servos for five joints and a hand with {words}, but this robot lacks {missing}; "
+        raise UnsupportedKinematics(description.path, f"{problem}choose hardware= and cell= that go together, or use backend=bullet")
     return tuple(
         load_calibration(wiring.calibration, arm, model) if wiring.calibration else nominal_calibration(config, arm, model)
         for arm, wiring in config.arms.items()
     )
+
+
+def lerobot_motors(calibration: ArmCalibration, model: ArmModel, ids: Sequence[int], closed: int) -> tuple[Motor, ...]:
+    """What LeRobot's file of an arm of bus servos says if the calibration is right: the middle of every joint's range is the URDF's zero.
+
+    Args:
+        calibration: of the arm, measured.
+        model: its kinematics.
+        ids: of its servos, the hand's last.
+        closed: counts of the hand's servo where the hand is closed.
+    """
+    motors = []
+    for index, (source, servo) in enumerate(zip(model.description.sources, calibration.maps, strict=True)):
+        middle = round(float(servo.to_us(-source.sign * source.offset_rad)))
+        half = min(middle, COUNTS - 1 - middle, *(abs(round(float(servo.to_us(end))) - middle) for end in calibration.limits_rad[index]))
+        motors.append(Motor(ids[index], calibration.homing_offsets[index], middle - half, middle + half))
+    hand = model.description.gripper
+    widest = round(closed + COUNTS_PER_RAD * (hand.joint_values(None)[hand.joints[0]] - hand.closed[0]) / hand.opening[0])
+    return (*motors, Motor(ids[-1], calibration.homing_offsets[-1], closed, min(widest, COUNTS - 1)))
 
 
 def _limits(model: ArmModel) -> tuple[tuple[float, float], ...]:
@@ -283,7 +337,7 @@ def load_backlash(folder: Path, arms: Sequence[str] = ARMS) -> dict[str, Floats]
     path = folder / BACKLASH_FILE
     if not path.is_file():
         raise MissingFile("backlash of the servos", path, _SERVOS_AGAIN)
-    with _stored("backlash of the servos", path, BACKLASH_VERSION, f", a band for each joint; {_SERVOS_AGAIN}") as content:
+    with stored("backlash of the servos", path, BACKLASH_VERSION, f", a band for each joint; {_SERVOS_AGAIN}") as content:
         found = {arm: np.array([float(content["half_band_us"][arm][joint]) for joint in ARM_JOINTS]) for arm in arms}
         for arm, values in found.items():
             for joint, value in zip(ARM_JOINTS, values, strict=True):
@@ -337,7 +391,7 @@ def require_one_set(folder: Path, names: Collection[str] = SERVO_FILES) -> None:
         if not (folder / name).is_file():
             raise MissingFile("servo calibration", folder / name, _SERVOS_AGAIN)
     path = folder / SET_FILE
-    with _stored("servo calibration", path, _SET_VERSION, f"; {_SERVOS_AGAIN}") as content:
+    with stored("servo calibration", path, _SET_VERSION, f"; {_SERVOS_AGAIN}") as content:
         wanted = {name: str(content["sha256"][name]) for name in names}
         others = [name for name in names if _digest(folder / name) != wanted[name]]
     if others:
@@ -346,57 +400,3 @@ def require_one_set(folder: Path, names: Collection[str] = SERVO_FILES) -> None:
 
 def _digest(path: Path) -> str:
     return hashlib.sha256(read_bounded(path, JSON_BYTES, "servo calibration")).hexdigest()
-
-
-def shifted(gripper: GripperConfig, further_mm: float) -> GripperConfig:
-    """``gripper`` with pulses at which each finger is ``further_mm`` nearer to closed.
-
-    Raises:
-        InvalidSetting: a servo has no such pulses.
-    """
-    shift_us = round(further_mm / gripper.open_mm * (gripper.closed_us - gripper.open_us))
-    moved = replace(gripper, open_us=gripper.open_us + shift_us, closed_us=gripper.closed_us + shift_us)
-    for name in _GRIPPERS_FOUND:
-        require_between(f"gripper.{name}", getattr(moved, name), *PULSE_US)
-    return moved
-
-
-def save_grippers(folder: Path, asked: Mapping[str, GripperConfig], found: Mapping[str, GripperConfig]) -> Path:
-    """Write what was found for all hands, whose settings were ``asked``, into ``folder``; what was there is kept beside it. Its path.
-
-    Raises:
-        CannotWrite: there is no room, or no folder.
-    """
-    path = folder / GRIPPERS_FILE
-    arms = {arm: {"settings": _picked(asked[arm], _GRIPPERS_ASKED), "found": _picked(found[arm], _GRIPPERS_FOUND)} for arm in found}
-    content = {"version": _GRIPPERS_VERSION, "measured_unix_s": time.time(), "arms": arms}
-    keep(path)
-    write_whole(path, json.dumps(content, indent=1) + "\n")
-    return path
-
-
-def with_grippers(hardware: HardwareConfig, folder: Path) -> HardwareConfig:
-    """``hardware`` with the pulses that were found for its hands; as it is if nobody has calibrated them.
-
-    Raises:
-        CorruptFile: the file cannot be read.
-        CalibrationProblem: its hands were set otherwise.
-    """
-    path = folder / GRIPPERS_FILE
-    if not path.is_file():
-        return hardware
-    with _stored("gripper calibration", path, _GRIPPERS_VERSION, f"; {_GRIPPERS_AGAIN}") as content:
-        asked = {arm: {name: float(content["arms"][arm]["settings"][name]) for name in _GRIPPERS_ASKED} for arm in hardware.arms}
-        found = {arm: {name: int(content["arms"][arm]["found"][name]) for name in _GRIPPERS_FOUND} for arm in hardware.arms}
-    for arm, wiring in hardware.arms.items():
-        now = _picked(wiring.gripper, _GRIPPERS_ASKED)
-        if now != asked[arm]:
-            raise CalibrationProblem(f"the {arm} gripper", f"{path} was found for {asked[arm]}, the settings say {now}; {_GRIPPERS_AGAIN}")
-        if not all(PULSE_US[0] <= pulse <= PULSE_US[1] for pulse in found[arm].values()):
-            raise CorruptFile("gripper calibration", path, f"pulses of {found[arm]}, a servo takes {PULSE_US[0]} to {PULSE_US[1]} us")
-    arms = {arm: replace(wiring, gripper=replace(wiring.gripper, **found[arm])) for arm, wiring in hardware.arms.items()}
-    return replace(hardware, arms=arms)
-
-
-def _picked(gripper: GripperConfig, names: tuple[str, ...]) -> dict[str, Any]:
-    return {name: getattr(gripper, name) for name in names}

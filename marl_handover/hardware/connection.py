@@ -15,9 +15,9 @@ from weakref import WeakSet
 from marl_handover.cell.build import CellModel
 from marl_handover.config import MotionConfig
 from marl_handover.hardware.board_group import BoardGroup, Pulses, Wiring, readback_state, require_held
-from marl_handover.hardware.calibration import ArmCalibration, calibrations
+from marl_handover.hardware.calibration import ArmCalibration, calibrations, require_own_arms
 from marl_handover.hardware.clock import Clock, RealClock
-from marl_handover.hardware.errors import BoardReset, DeviceError, PortLost, PulseMismatch, Stopped, WrongState
+from marl_handover.hardware.errors import ArmingLost, ConnectionLost, DeviceError, PulseMismatch, Stopped, WrongState
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.safety_filter import JointCommand, SafetyFilter
 from marl_handover.hardware.settings import HardwareConfig
@@ -111,9 +111,11 @@ class ArmConnection:
         if not self.config.gate.enabled:
             LOG.warning(FILTER_OFF)
         self.calibrations = calibrations(self.config, self.model.arm)
+        require_own_arms(self.calibrations, self.boards.marks(self.config))
         self._safety_filter = SafetyFilter(self.model, self.config, self.calibrations)
         pin_mm = self.model.cell.config.block.pin_diameter_mm
-        self._wiring = Wiring(self.config, self.calibrations, pin_mm, self._safety_filter.speed_rad_s)
+        hand = self.model.arm.description.gripper
+        self._wiring = Wiring(self.config, self.calibrations, hand, pin_mm, self._safety_filter.speed_rad_s)
         self.state = State.CONFIGURED
 
     def reconnect(self) -> None:
@@ -158,7 +160,7 @@ class ArmConnection:
 
         Raises:
             PulseMismatch: one does not; every channel was told to stop, and moves are refused until :meth:`resume`.
-            BoardReset, PortLost, BadReply: the electronics failed.
+            ArmingLost, ConnectionLost, BadReply: the electronics failed.
             Stopped: the stop is latched.
         """
         end_s = self.clock.now_s() + _PATIENCE_S
@@ -172,8 +174,19 @@ class ArmConnection:
                 self.wait(self.config.stream.poll_s)
 
     def settle(self, duration_s: float) -> None:
-        """Wait until moves are over, and see that they were carried out. Raises as :meth:`check_pulses`."""
-        self.wait(duration_s)
+        """Wait until moves are over, and see that they were carried out; servos with encoders are brought nearer to where they were sent.
+
+        Raises as :meth:`check_pulses`.
+        """
+        end_s = self.clock.now_s() + duration_s
+        while self.config.stream.check_reset and self.boards.have_encoders and self.clock.now_s() + self.config.stream.period_s < end_s:
+            self.wait(self.config.stream.period_s)
+            self.check_pulses()
+            with self._writing:
+                self.check_stop()
+                if self.state in (State.ARMING, State.ARMED):
+                    self.boards.correct()
+        self.wait(end_s - self.clock.now_s())
         if self.config.stream.check_reset:
             self.check_pulses()
 
@@ -208,7 +221,7 @@ class ArmConnection:
     def resume(self) -> None:
         """After the stop was cleared: read back where the channels are, to 10 us, and allow moves from there.
 
-        Raises :class:`Stopped` while the stop is latched, :class:`BoardReset` if a board has forgotten any channel, and
+        Raises :class:`Stopped` while the stop is latched, :class:`ArmingLost` if a board has forgotten any channel, and
         :class:`CommandRejected` if it holds one outside its limits.
         """
         if self.state is not State.STOPPED:
@@ -218,6 +231,7 @@ class ArmConnection:
         halts = self._halts
         if not self.dry_run:
             with self._watched():
+                self.boards.require_holding()
                 self._refer(self.boards.pulses())
         with self._allowed(State.STOPPED):
             if halts != self._halts:
@@ -227,7 +241,7 @@ class ArmConnection:
     def torque_off(self) -> None:
         """No more pulses: the arms sink. They have to be put into the parked pose and armed again. In a dry run nothing sinks.
 
-        Raises :class:`PortLost` if a board was not reached; the others' arms sink all the same.
+        Raises :class:`ConnectionLost` if a board was not reached; the others' arms sink all the same.
         """
         try:
             with self._writing, self._watched():
@@ -242,10 +256,10 @@ class ArmConnection:
         """Keep the state true when electronics fail."""
         try:
             yield
-        except PortLost:
+        except ConnectionLost:
             self.state = State.LOST
             raise
-        except BoardReset:
+        except ArmingLost:
             self.safety_filter.forget()
             self.state = State.CONFIGURED
             raise

@@ -31,7 +31,7 @@ from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.expected_pulses import SETTLED_S
 from marl_handover.hardware.safety_filter import JointCommand
 from marl_handover.hardware.settings import HardwareConfig
-from marl_handover.hardware.ssc32 import LineRecord
+from marl_handover.hardware.transport import LineRecord
 from marl_handover.motion.home import parked_poses
 
 
@@ -47,6 +47,10 @@ _RESTATED_S = 0.2
 """Time for moves of half a reading, to where arms are held already."""
 
 _DRIVE = "The boards hold the arms. They will be driven slowly to the parked pose: is the way free, and a hand at the power switch?"
+_SWITCH_ON = (
+    "The servos will be switched on where the arms stand, and drive them slowly to the parked pose: do they stand free of the table and of "
+    "each other, best upright and drawn in, and is a hand at the power switch?"
+)
 _LET_GO = (
     "A board has forgotten some servos while others are held. All will be let go: the arms sink. Are hands under them, or may they sink?"
 )
@@ -128,7 +132,8 @@ class ArmDriver(ArmConnection):
             self.safety_filter.check_stand(commands)
             pulses = self._all_or_none()
             jump = _JUMP.format("both" if len(commands) == 2 else f"all {len(commands)}")
-            self._ask((_DRIVE if all_held(pulses) else jump) + self._warning())
+            driven = _SWITCH_ON if self.boards.have_encoders else _DRIVE
+            self._ask((driven if all_held(pulses) else jump) + self._warning())
             sent = self._jump(commands) if none_held(pulses) else self._drive_parked(commands)
             if not self.dry_run:
                 self.check_pulses()
@@ -146,7 +151,7 @@ class ArmDriver(ArmConnection):
             CommandRejected: it must not be sent.
             Stopped: the stop is latched; every channel was told to stop.
             PulseMismatch: a board does not do what it is told; every channel was told to stop.
-            BoardReset, PortLost, BadReply: the electronics failed; the arms have to be armed again, or the port connected.
+            ArmingLost, ConnectionLost, BadReply: the electronics failed; the arms have to be armed again, or the port connected.
         """
         return self._move(commands, duration_s, made_s, State.ARMED)
 
@@ -181,6 +186,7 @@ class ArmDriver(ArmConnection):
         if self.state is not State.CONFIGURED:
             raise WrongState("resync", self.state, State.CONFIGURED)
         with self._arming():
+            self.boards.require_holding()
             self._restate()
 
     def park(self) -> None:
@@ -307,7 +313,7 @@ class ArmDriver(ArmConnection):
         """Send every channel where it is held, and take it for where the arms are. A joint at its limit is not sent past it."""
         pulses = self.boards.pulses()
         stay = self._refer(pulses)
-        wanted, within = readback_middles(pulses), self.wiring.pulses(stay)
+        wanted, within = readback_middles(pulses, self.config.unit), self.wiring.pulses(stay)
         for wiring in self.config.arms.values():
             wanted[wiring.board].update({channel: within[wiring.board][channel] for channel in wiring.channels})
         with self._allowed(State.ARMING):

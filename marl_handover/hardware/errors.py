@@ -58,7 +58,15 @@ class PortNotFound(DeviceError):
         super().__init__(f"serial port {port or '(not set)'}: {reason}; ports found: {listing}; set hardware.boards.<name>.port")
 
 
-class PortLost(DeviceError):
+class ConnectionLost(DeviceError):
+    """What drives the arms is out of reach. They hold, or finish the move that they are in, until it is connected again."""
+
+
+class ArmingLost(DeviceError):
+    """Some servos hold no more, or will not: the arms have to be armed again."""
+
+
+class PortLost(ConnectionLost):
     """The port failed while in use: a cable came out, or another program has it open as well."""
 
     def __init__(self, port: str, what: str, reason: str) -> None:
@@ -97,7 +105,7 @@ class BadReply(DeviceError):
         super().__init__(f"{asked} was answered by {reply[:32]!r}: expected {wanted}")
 
 
-class ServoMissing(DeviceError):
+class ServoMissing(ConnectionLost):
     """Servos on a bus do not answer."""
 
     def __init__(self, bus: str, servos: Iterable[int], present: Iterable[int] | None = None) -> None:
@@ -117,15 +125,15 @@ class DuplicateServo(DeviceError):
         super().__init__(f"{asked}: servo {servo} answered twice: two servos on this bus have that id; give one of them another")
 
 
-class ServoFault(DeviceError):
+class ServoFault(ArmingLost):
     """A servo answers, and reports trouble."""
 
     def __init__(self, bus: str, servo: int, what: str) -> None:
         self.bus, self.servo, self.what = bus, servo, what
-        super().__init__(f"bus {bus}: servo {servo} reports {what.lower()}; an overload ends when its torque is switched off")
+        super().__init__(f"bus {bus}: servo {servo} reports {what}; its arm has to be armed again, which ends an overload")
 
 
-class BoardReset(DeviceError):
+class BoardReset(ArmingLost):
     """The board has forgotten its servos: it was reset, most likely by a supply that broke down under load."""
 
     def __init__(self, board: str, channels: Iterable[int]) -> None:
@@ -148,6 +156,19 @@ class PulseMismatch(DeviceError):
             f"board {board}, channel {channel} puts out {pulse_us} us, where it was sent {wanted} (tolerance {tolerance_us:g} us): the "
             "board does not do what it is told, or does not say what it does. Every channel was told to stop; check the board, its supply "
             "and its cable, then arm again"
+        )
+
+
+class ServoAstray(PulseMismatch):
+    """A bus servo does not stand where it was sent: something holds it, or it is too weak."""
+
+    def __init__(self, bus: str, servo: int, counts: int, wanted: tuple[float, float], tolerance: float) -> None:
+        self.board, self.channel, self.pulse_us, self.wanted_us = bus, servo, counts, wanted
+        off_deg = 360 / 4096 * max(wanted[0] - counts, counts - wanted[1])
+        DeviceError.__init__(
+            self,
+            f"bus {bus}: servo {servo} stands {off_deg:.0f} degrees from where it was sent (tolerance {360 / 4096 * tolerance:.0f}): "
+            "something holds it, or it is too weak. Every servo was told to hold; clear the way, then arm again",
         )
 
 

@@ -7,17 +7,14 @@ Source: Feetech's protocol manual and memory table of the STS series, V3.6, and 
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import IntFlag
 from itertools import pairwise
 from numbers import Integral
 from typing import Any, NamedTuple, TypeVar
 
-from marl_handover.hardware.clock import Clock
-from marl_handover.hardware.errors import BadCommand, BadReply, DuplicateServo, ServoFault, ServoMissing, WrongState
-from marl_handover.hardware.settings import BoardConfig, TimeoutConfig
-from marl_handover.hardware.transport import Logged, Wire, choose_port
+from marl_handover.hardware.errors import BadCommand, BadReply, DuplicateServo, ServoFault, ServoMissing
+from marl_handover.hardware.transport import WiredDevice
 
 HEADER = b"\xff\xff"
 BROADCAST = 0xFE
@@ -26,9 +23,6 @@ LAST_ID = 0xFC
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x82, 0x83
 MAX_PARAMETERS = 250
-
-COUNTS = 4096
-"""Of a full turn."""
 
 MODEL = 777
 """What an STS3215 says it is."""
@@ -43,6 +37,11 @@ class Status(IntFlag):
     CURRENT = 8
     ANGLE = 16
     OVERLOAD = 32
+
+
+def words(status: Status) -> str:
+    """What a servo reports, in words."""
+    return ", ".join(str(flag.name).lower() for flag in Status if flag in status)
 
 
 class Register(NamedTuple):
@@ -176,10 +175,10 @@ def write(servo: int, name: str, value: int) -> bytes:
     return packet(servo, WRITE, bytes([_writable(name).address]) + encoded(name, value))
 
 
-def sync_read(name: str, servos: Sequence[int]) -> bytes:
-    """Ask several servos for a register; they answer one after the other, in this order."""
-    register = REGISTERS[name]
-    return packet(BROADCAST, SYNC_READ, bytes([register.address, register.size, *_distinct(servos)]))
+def sync_read(names: str | Sequence[str], servos: Sequence[int]) -> bytes:
+    """Ask several servos for a register, or for all from the first to the last of some; they answer one after the other, in this order."""
+    first, size = _span([names] if isinstance(names, str) else names)
+    return packet(BROADCAST, SYNC_READ, bytes([first, size, *_distinct(servos)]))
 
 
 def sync_write(names: Sequence[str], values: Mapping[int, Sequence[int]]) -> bytes:
@@ -220,6 +219,13 @@ def parse_replies(asked: str, heard: bytes, size: int) -> list[Reply]:
     return replies
 
 
+def _span(names: Sequence[str]) -> tuple[int, int]:
+    """The address of the first of some registers, and the number of bytes to the end of the last."""
+    registers = [REGISTERS[name] for name in names]
+    first = min(register.address for register in registers)
+    return first, max(register.address + register.size for register in registers) - first
+
+
 def _writable(name: str) -> Register:
     register = REGISTERS[name]
     if not register.writable:
@@ -252,59 +258,26 @@ GAP_BYTES = 3
 QUIET_S = 0.003
 
 
-class FeetechBus:
-    """A chain of servos on one port, every answer checked, asked again when it is damaged, and the bus made quiet in between.
+class FeetechBus(WiredDevice):
+    """A chain of servos on one port, every answer checked, asked again when it is damaged, and the bus made quiet in between."""
 
-    Args:
-        name: of the bus in the settings.
-        config: its port and rate.
-        timeouts: limits of waiting.
-        clock: time.
-        log_entries: length of the byte log.
-        on_wait: is called time and again while an answer is waited for; it may raise.
-    """
+    echo = False
+    """Whether the adapter hands back what is sent, as bare one-wire wiring does."""
 
-    def __init__(
-        self,
-        name: str,
-        config: BoardConfig,
-        timeouts: TimeoutConfig,
-        clock: Clock,
-        *,
-        log_entries: int = 20_000,
-        on_wait: Callable[[], object] = lambda: None,
-    ) -> None:
-        self.name, self.config = name, config
-        self.echo = False
-        """Whether the adapter hands back what is sent, as bare one-wire wiring does."""
-        self._timeouts, self._clock, self._attend = timeouts, clock, on_wait
-        self._log: deque[Logged] = deque(maxlen=log_entries)
-        self._wire: Wire | None = None
-
-    @property
-    def wire(self) -> Wire:
-        """The open port. Raises :class:`WrongState` if there is none."""
-        if self._wire is None:
-            raise WrongState("use the bus", "not connected", "connected")
-        return self._wire
-
-    @property
-    def log(self) -> list[Logged]:
-        """Every byte with its time, as far back as the log goes."""
-        return list(self._log)
-
-    def connect(self, servos: Sequence[int]) -> dict[int, int]:
-        """Open the port and find servos on it; their models by id.
+    def open(self, servos: Sequence[int]) -> dict[int, int]:
+        """Open the port and find servos on it, none without any; their models by id.
 
         Raises:
             PortNotFound: there is no port, or it is in use.
             ServoMissing: some do not answer; the message says who does.
         """
         self.close()
-        self._wire = Wire(choose_port(self.config.port), self.config.baud, self._timeouts, self._clock, self._log)
+        self._wire = self._opened()
         try:
             self.echo = ping(BROADCAST) in self.wire.ask(ping(BROADCAST), REPLY_BYTES, on_wait=self._attend)
             self.wire.drain(QUIET_S, self._attend)
+            if not servos:
+                return {}
             self.read_all("present_position", servos)  # where two have one id, their answers differ here and clash
             return self.read_all("model", servos)
         except BaseException as error:
@@ -313,12 +286,6 @@ class FeetechBus:
             if isinstance(error, ServoMissing):
                 raise ServoMissing(self.name, error.servos, present) from None
             raise
-
-    def close(self) -> None:
-        """Let the port go; servos keep what they do. Again is fine."""
-        if self._wire is not None:
-            self._wire.close()
-        self._wire = None
 
     def scan(self, last: int = 20) -> list[int]:
         """Ids up to ``last`` that answer a ping."""
@@ -333,30 +300,32 @@ class FeetechBus:
         return decoded(name, self._one(name, servo, read(servo, name), REGISTERS[name].size).data)
 
     def read_all(self, name: str, servos: Sequence[int]) -> dict[int, int]:
-        """A register of several servos in one question; those that are not heard are asked again, one by one.
+        """A register of several servos in one question; those that are not heard are asked again.
 
         Raises :class:`ServoMissing` with all that never answered.
         """
-        size, found = REGISTERS[name].size, {}
-        for reply in self._heard(name, sync_read(name, servos), len(servos), size):
-            if reply.servo in servos:
-                found[reply.servo] = decoded(name, reply.data)
-        missing = []
-        for servo in servos:
-            if servo not in found:
-                try:
-                    found[servo] = self.read(servo, name)
-                except ServoMissing:
-                    missing.append(servo)
-        if missing:
-            raise ServoMissing(self.name, missing)
-        return {servo: found[servo] for servo in servos}
+        return {servo: row[0] for servo, row in self.read_group((name,), servos).items()}
+
+    def read_group(self, names: Sequence[str], servos: Sequence[int]) -> dict[int, tuple[int, ...]]:
+        """Registers that lie near each other, of several servos, in one question; as :meth:`read_all`."""
+        first, size = _span(names)
+        found: dict[int, tuple[int, ...]] = {}
+        missing = list(servos)
+        for _ in range(1 + self._timeouts.retries):
+            for reply in self._heard(names[0], sync_read(names, missing), len(missing), size):
+                parts = (reply.data[REGISTERS[name].address - first :][: REGISTERS[name].size] for name in names)
+                found[reply.servo] = tuple(decoded(name, part) for name, part in zip(names, parts, strict=True))
+            missing = [servo for servo in servos if servo not in found]
+            if not missing:
+                return {servo: found[servo] for servo in servos}
+            self.wire.drain(QUIET_S, self._attend)
+        raise ServoMissing(self.name, missing)
 
     def write(self, servo: int, name: str, value: int) -> None:
         """Set a register and wait for the servo's answer. Raises :class:`ServoMissing`; :class:`ServoFault` if it reports trouble."""
         reply = self._one(name, servo, write(servo, name, value), 0)
         if reply.status:
-            raise ServoFault(self.name, servo, reply.status.name or str(int(reply.status)))
+            raise ServoFault(self.name, servo, words(reply.status))
 
     def write_all(self, names: Sequence[str], values: Mapping[int, Sequence[int]]) -> None:
         """Set registers that lie side by side, of several servos at once. Nobody answers: read back what matters."""

@@ -115,7 +115,7 @@ class SafetyFilter:
         self._closed_mm = model.cell.config.block.pin_diameter_mm / 2 + GRASP_MM
         self._least_mm = np.array([self.limits.table_clearance_mm, self.limits.self_clearance_mm, -self.limits.block_dip_mm])
         self._bases = [np.array([base.x_mm, base.y_mm, base.facing_rad]) for base in model.cell.bases]
-        self._pulses = [np.array(wiring.pulse_limits_us, float) for wiring in config.arms.values()]
+        self._pulses, self._unit = [np.array(config.pulse_limits(name), float) for name in config.arms], config.unit.name
         speeds = [model.arm.description.joint(name).velocity for name in ARM_JOINTS]
         self.speed_rad_s = config.gate.speed_share * np.array(speeds)
         self._speed = np.append(self.speed_rad_s, config.gate.finger_mm_s)
@@ -250,7 +250,7 @@ class SafetyFilter:
             raise self._rejected(Reason.GRIPPER, arm, "the opening of each finger", float(target[5]), f"0 to {self.limits.finger_mm:g} mm")
         for joint, pulse, (low, high) in zip(ARM_JOINTS, np.rint(self.calibrations[arm].to_us(target[:5])), self._pulses[arm], strict=True):
             if not low <= pulse <= high:
-                raise self._rejected(Reason.PULSE_LIMIT, arm, f"the pulse of {joint}", float(pulse), f"{low:g} to {high:g} us")
+                raise self._rejected(Reason.PULSE_LIMIT, arm, f"the pulse of {joint}", float(pulse), f"{low:g} to {high:g} {self._unit}")
 
     def _check_way(self, arm: int, change: Floats, duration_s: float) -> None:
         """Whether an arm may change so much, joints and fingers (6,), in one command."""

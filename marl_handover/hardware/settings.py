@@ -6,12 +6,14 @@ and what the emulated servos are like.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
-from marl_handover.config import bounded, check_bounds, chosen, name_field, path_field, seed_field
+from marl_handover.config import bounded, check_bounds, chosen, name_field, path_field, require_between, seed_field
 from marl_handover.errors import InvalidSetting, listed
 from marl_handover.geometry.urdf import ARM_JOINTS
 from marl_handover.hardware.session_registry import user_path
@@ -29,7 +31,24 @@ BAUDS = (115200, 38400, 9600, 2400)
 SERVO_BAUDS = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
 """Rates of bus servos, by the value of their register."""
 
-PROTOCOLS = ("ssc32", "feetech")
+
+class ServoUnit(NamedTuple):
+    """What a servo is told: a pulse, in a unit of its own, from ``lower`` to ``upper``; it is told back in steps of ``reading``."""
+
+    name: str
+    lower: int
+    upper: int
+    reading: int
+
+
+COUNTS = 4096
+"""Of a full turn of a bus servo."""
+COUNTS_PER_RAD = COUNTS / (2 * math.pi)
+
+PROTOCOLS = {"ssc32": ServoUnit("us", *PULSE_US, READING_US), "feetech": ServoUnit("counts", 0, COUNTS - 1, 1)}
+"""What drives servos may speak, and the unit of their pulses: microseconds of a board's, counts of the encoder of a bus servo."""
+
+_WIDEST = (0, COUNTS - 1)
 FIRST_MOVES = ("ask", "refuse")
 ON_DISCONNECT = ("hold", "limp", "park")
 TWIN = "twin"
@@ -58,8 +77,8 @@ class GripperConfig:
     """The gripper is closed by position: to the pin and a little further, never to its end, which strips the servo's gears."""
 
     channel: int = bounded(4, 0, CHANNELS - 1)
-    open_us: int = bounded(1000, *PULSE_US)  # pulse at open_mm
-    closed_us: int = bounded(1900, *PULSE_US)  # pulse at 0 mm
+    open_us: int = bounded(1000, *_WIDEST)  # pulse at open_mm; a bus servo's opening follows from the hand's URDF
+    closed_us: int = bounded(1900, *_WIDEST)  # pulse at 0 mm; of a bus servo in counts
     open_mm: float = bounded(14.0, 1.0, 50.0)  # how far each finger is from closed there
     preload_mm: float = bounded(0.6, 0.0, 3.0)  # how far into the pin each finger is sent; the servo's softness makes it a force
 
@@ -73,6 +92,7 @@ class ArmWiring:
     gripper: GripperConfig = field(default_factory=GripperConfig)
     pulse_limits_us: list[list[int]] = bounded([list(PULSE_US) for _ in ARM_JOINTS], *PULSE_US, (1, 32), (2, 2))  # [lower, upper] each
     calibration: str = path_field()  # file of calibrate servos; empty: nominal values, good enough to test directions, not to grasp
+    lerobot: str = path_field()  # LeRobot's calibration file of an arm of bus servos: where calibrate begins; empty: zeros in the middle
 
 
 @dataclass
@@ -134,6 +154,19 @@ class TimeoutConfig:
 
 
 @dataclass
+class BusConfig:
+    """How bus servos are set, and what of their encoders is believed. Not used by boards."""
+
+    p: int = bounded(32, 1, 254)  # stiffness, as shipped; half of it sags twice as far
+    d: int = bounded(32, 0, 254)
+    acceleration: int = bounded(150, 1, 254)  # 100 counts/s^2
+    gripper_torque: int = bounded(500, 50, 1000)  # per mille of the stall torque that a hand closes with
+    follow_deg: float = bounded(8.0, 1.0, 45.0)  # a servo this far from where it was sent is held by something, or too weak
+    trim_deg: float = bounded(6.0, 0.0, 20.0)  # how far beyond its place a servo is sent at most, so that it does not sag
+    trim_share: float = bounded(0.5, 0.0, 1.0)  # part of what a servo sags that each command takes out
+
+
+@dataclass
 class EmulatorConfig:
     """Emulated servos: what they are like, and by how much each differs from the nominal one. Errors are drawn from ``seed``."""
 
@@ -146,6 +179,10 @@ class EmulatorConfig:
     settle_sd_us: float = bounded(1.0, 0.0, 50.0)  # where a servo comes to rest, drawn anew at each stop
     speed_deg_s: list[float] = bounded([333.0, 261.0, 261.0, 300.0, 545.0, 545.0], 1.0, 5000.0)  # at 6 V; the last is the gripper's
     end_stop_deg: float = bounded(5.0, 0.0, 90.0)  # how far beyond the URDF's limits the end stops are
+    bus_zero_deg: float = bounded(3.0, 0.0, 45.0)  # zeros of bus servos are anywhere so far off, either way
+    bus_play_deg: list[float] = bounded([0.6, 1.3], 0.0, 10.0, (2, 2))  # play of their gears, least and most
+    bus_stiffness_share: float = bounded(0.15, 0.0, 0.9)  # how far their stiffness is off at most, relative
+    supply_v: float = bounded(7.4, 3.0, 15.0)
     firmware: str = "SSC32-V2.50USB"
     boot_s: float = bounded(0.2, 0.0, 30.0)
 
@@ -172,11 +209,12 @@ class HardwareConfig:
     name: str = name_field("lynxmotion")  # its calibration is kept in a folder of this name
     boards: dict[str, BoardConfig] = field(default_factory=lambda: {"main": BoardConfig()})
     arms: dict[str, ArmWiring] = field(default_factory=_pair)
-    protocol: str = chosen("ssc32", PROTOCOLS)  # what boards speak: ssc32, or feetech: a bus of servos each, channels are their ids
+    protocol: str = chosen("ssc32", tuple(PROTOCOLS))  # what boards speak: ssc32, or feetech: a bus of servos each, channels are their ids
     nominal: dict[str, ServoNominal] = field(default_factory=_nominal)
     gate: SafetyFilterConfig = field(default_factory=SafetyFilterConfig)
     stream: StreamConfig = field(default_factory=StreamConfig)
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
+    bus: BusConfig = field(default_factory=BusConfig)
     emulator: EmulatorConfig = field(default_factory=EmulatorConfig)
     first_move: str = chosen("ask", FIRST_MOVES)  # ask somebody to confirm the parked pose, or refuse to move a board that has no reference
     on_disconnect: str = chosen("hold", ON_DISCONNECT)  # hold (servos stay on), limp (arms sink), park (drive there, then hold)
@@ -222,10 +260,14 @@ class HardwareConfig:
         self._check_plugs(wanted)
         return replace(self, arms={name: self.arms[name] for name in wanted})
 
-    def require_boards(self) -> None:
-        """Raise :class:`InvalidSetting` for servos on a bus: what drives arms speaks to boards alone so far."""
-        if self.protocol != "ssc32":
-            raise InvalidSetting("hardware.protocol", self.protocol, "'ssc32': bus servos are emulated, and driven by FeetechBus, alone")
+    @property
+    def unit(self) -> ServoUnit:
+        """Of every pulse in these settings."""
+        return PROTOCOLS[self.protocol]
+
+    def pulse_limits(self, arm: str) -> list[list[int]]:
+        """Least and greatest pulse of each joint of an arm."""
+        return self.arms[arm].pulse_limits_us if self.protocol == "ssc32" else [[self.unit.lower, self.unit.upper] for _ in ARM_JOINTS]
 
     def require_grip(self, pin_diameter_mm: float) -> None:
         """Raise :class:`InvalidSetting` for fingers that would close to their end, whatever is between them: that strips gears."""
@@ -270,7 +312,9 @@ class HardwareConfig:
         limits = arm.pulse_limits_us
         if len(limits) != len(ARM_JOINTS) or not all(len(pair) == 2 and PULSE_US[0] <= pair[0] < pair[1] <= PULSE_US[1] for pair in limits):
             raise InvalidSetting(f"{name}.pulse_limits_us", limits, f"a pair [lower, upper] a joint, within {PULSE_US[0]} to {PULSE_US[1]}")
-        gripper = arm.gripper
+        gripper, unit = arm.gripper, self.unit
+        for key in ("closed_us", "open_us") if self.protocol == "ssc32" else ("closed_us",):
+            require_between(f"{name}.gripper.{key}", getattr(gripper, key), unit.lower, unit.upper)
         if gripper.open_us == gripper.closed_us:
             raise InvalidSetting(f"{name}.gripper.open_us", gripper.open_us, "another pulse than closed_us")
 

@@ -8,11 +8,10 @@ the design notes. ``T`` is in milliseconds (the guide says microseconds once; it
 from __future__ import annotations
 
 import re
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.errors import (
@@ -27,7 +26,6 @@ from marl_handover.hardware.errors import (
     PortLost,
     PulseMismatch,
     UnsuitableFirmware,
-    WrongState,
 )
 from marl_handover.hardware.expected_pulses import ExpectedPulses, PulseRange
 from marl_handover.hardware.settings import (
@@ -41,7 +39,7 @@ from marl_handover.hardware.settings import (
     StreamConfig,
     TimeoutConfig,
 )
-from marl_handover.hardware.transport import CANCEL, Logged, Wire, choose_port
+from marl_handover.hardware.transport import BITS_PER_BYTE, CANCEL, LineRecord, Wire, WiredDevice
 
 MAX_LINE_BYTES = 256
 """No buffer size is published; this fits positions of all 32 channels with a time, and no driver in use sends longer lines."""
@@ -199,27 +197,11 @@ MOVED_US = 100
 """A pulse may change by this much between two readings while a move goes on."""
 
 
-class LineRecord(NamedTuple):
-    """A line and when it was handed over; ``written`` is False in a dry run."""
+class Ssc32(WiredDevice):
+    """A board by the name it has in the settings. ``dry_run``: write queries and stops only; the other arguments are the base class's."""
 
-    board: str
-    t_s: float
-    data: bytes
-    written: bool
-
-
-class Ssc32:
-    """A board by the name it has in the settings.
-
-    Args:
-        name: of the board.
-        config: its port and rate.
-        timeouts: limits of waiting.
-        clock: time.
-        log_entries: length of the byte log.
-        dry_run: write queries and stops only.
-        on_wait: is called time and again while an answer is waited for; it may raise.
-    """
+    has_encoders = False
+    """Where a servo stands that has no pulse, nobody knows: its first move is a jump."""
 
     def __init__(
         self,
@@ -232,30 +214,16 @@ class Ssc32:
         dry_run: bool = False,
         on_wait: Callable[[], object] = lambda: None,
     ) -> None:
-        self.name, self.config, self.dry_run = name, config, dry_run
+        super().__init__(name, config, timeouts, clock, log_entries=log_entries, on_wait=on_wait)
+        self.dry_run = dry_run
         self.firmware: Firmware | None = None
-        self._timeouts, self._clock = timeouts, clock
-        self._log: deque[Logged] = deque(maxlen=log_entries)
-        self._wire: Wire | None = None
         self._known: set[int] = set()
-        self._expected, self._attend = ExpectedPulses(), on_wait
-
-    @property
-    def wire(self) -> Wire:
-        """The open port. Raises :class:`WrongState` if there is none."""
-        if self._wire is None:
-            raise WrongState("use the board", "not connected", "connected")
-        return self._wire
+        self._expected = ExpectedPulses()
 
     @property
     def connected(self) -> bool:
         """Whether a board has answered and the port is still open."""
         return self._wire is not None and self.firmware is not None
-
-    @property
-    def log(self) -> list[Logged]:
-        """Every byte with its time, as far back as the log goes, whatever became of the port meanwhile."""
-        return list(self._log)
 
     def connect(self) -> Firmware:
         """Open the port and find the board on it, trying other rates if allowed; every channel counts as never moved.
@@ -266,7 +234,7 @@ class Ssc32:
             UnsuitableFirmware: it is no SSC-32, or one without ``STOP``.
         """
         self.close()
-        wire = Wire(choose_port(self.config.port), self.config.baud, self._timeouts, self._clock, self._log)
+        wire = self._opened()
         try:
             self.firmware = self._handshake(wire)
         except BaseException:
@@ -277,9 +245,8 @@ class Ssc32:
 
     def close(self) -> None:
         """Let the port go; the servos keep their last pulse. Again is fine."""
-        if self._wire is not None:
-            self._wire.close()
-        self._wire, self.firmware = None, None
+        super().close()
+        self.firmware = None
         self._forget()
 
     def pulses(self, channels: Iterable[int]) -> dict[int, int | None]:
@@ -294,6 +261,17 @@ class Ssc32:
                 return now
             before = now
         raise BadReply("QP", repr(before).encode(), "the same pulses twice")
+
+    def correct(self) -> None:
+        """Nothing: nobody tells what is missing."""
+
+    def marks(self, channels: Iterable[int]) -> tuple[int, ...]:
+        """None: hobby servos keep nothing."""
+        return ()
+
+    def limp(self, channels: Iterable[int]) -> list[int]:
+        """None: of a servo that does not hold nobody knows where it stands, and :meth:`pulses` says so."""
+        return []
 
     def moving(self) -> bool:
         """Whether the last move's time is not over. It says nothing of servos that were stopped, and some boards get stuck on True."""
@@ -358,6 +336,11 @@ class Ssc32:
         written_s = self.wire.write(data)
         self._expected.stop(listed, written_s, self._clock.now_s() + self.wire.backlog_s())
         return LineRecord(self.name, written_s, data, True)
+
+    def stop_s(self, channels: Sequence[int]) -> float:
+        """How long a stop is on the wire at worst: it waits for the longest line."""
+        longest = group_move(dict.fromkeys(channels, PULSE_US[1]), TIME_MS[1], dict.fromkeys(channels, SPEED_US_S[1]))
+        return (len(longest) + len(stop(channels))) * BITS_PER_BYTE / self.wire.baud
 
     def torque_off(self, channels: Iterable[int]) -> LineRecord:
         """No more pulses: arms sink, but for a dry run. The next move is a first one."""

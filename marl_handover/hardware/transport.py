@@ -16,8 +16,8 @@ import serial
 from serial.tools import list_ports
 
 from marl_handover.hardware.clock import Clock
-from marl_handover.hardware.errors import FlushFailed, PortLost, PortNotFound
-from marl_handover.hardware.settings import TimeoutConfig
+from marl_handover.hardware.errors import FlushFailed, PortLost, PortNotFound, WrongState
+from marl_handover.hardware.settings import BoardConfig, TimeoutConfig
 
 BITS_PER_BYTE = 10
 CANCEL = b"\x1b"
@@ -40,6 +40,15 @@ class Logged(NamedTuple):
     t_s: float
     direction: str
     data: bytes
+
+
+class LineRecord(NamedTuple):
+    """A line and when it was handed over; ``written`` is False in a dry run."""
+
+    board: str
+    t_s: float
+    data: bytes
+    written: bool
 
 
 class Wire:
@@ -161,26 +170,85 @@ class Wire:
             raise PortLost(self.port, what, " ".join(str(error).split())) from error
 
 
+class WiredDevice:
+    """What is reached over a wire, open or not.
+
+    Args:
+        name: of the board or bus in the settings.
+        config: its port and rate.
+        timeouts: limits of waiting.
+        clock: time.
+        log_entries: length of the byte log.
+        on_wait: is called time and again while an answer is waited for; it may raise.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        config: BoardConfig,
+        timeouts: TimeoutConfig,
+        clock: Clock,
+        *,
+        log_entries: int = 20_000,
+        on_wait: Callable[[], object] = lambda: None,
+    ) -> None:
+        self.name, self.config = name, config
+        self._timeouts, self._clock, self._attend = timeouts, clock, on_wait
+        self._log: deque[Logged] = deque(maxlen=log_entries)
+        self._wire: Wire | None = None
+
+    @property
+    def wire(self) -> Wire:
+        """The open port. Raises :class:`WrongState` if there is none."""
+        if self._wire is None:
+            raise WrongState(f"use {self.name}", "not connected", "connected")
+        return self._wire
+
+    @property
+    def log(self) -> list[Logged]:
+        """Every byte with its time, as far back as the log goes, whatever became of the port meanwhile."""
+        return list(self._log)
+
+    def close(self) -> None:
+        """Let the port go; servos keep what they do. Again is fine."""
+        if self._wire is not None:
+            self._wire.close()
+        self._wire = None
+
+    def _opened(self) -> Wire:
+        """A wire to the port of the settings, or to the only likely one. Raises :class:`PortNotFound`."""
+        return Wire(choose_port(self.config.port), self.config.baud, self._timeouts, self._clock, self._log)
+
+
 FTDI = (0x0403, 0x6001)
 """Vendor and product of the USB chip on an SSC-32U, and in most cables of an SSC-32."""
+
+WCH = 0x1A86
+"""Vendor of the USB chips on the adapters that are sold for bus servos."""
 
 _BY_ID = Path("/dev/serial/by-id")
 _USB_SERIAL = Path("/sys/bus/usb-serial/devices")
 
 
 class PortInfo(NamedTuple):
-    """A port: the name to use, what it says about itself, and whether its USB chip is of the kind the boards have."""
+    """A port: the name to use, what it says about itself, and whether its USB chip is of a kind that boards have, or adapters of buses."""
 
     path: str
     description: str
     likely: bool
+    bus: bool = False
 
 
 def list_serial_ports() -> list[PortInfo]:
     """All ports, likely ones first; nothing is opened."""
     stable = {str(link.resolve()): str(link) for link in sorted(_BY_ID.glob("*"))} if _BY_ID.is_dir() else {}
     found = [
-        PortInfo(stable.get(str(Path(port.device).resolve()), port.device), port.description or "", (port.vid, port.pid) == FTDI)
+        PortInfo(
+            stable.get(str(Path(port.device).resolve()), port.device),
+            port.description or "",
+            (port.vid, port.pid) == FTDI,
+            port.vid == WCH,
+        )
         for port in list_ports.comports()
     ]
     return sorted(found, key=lambda port: (not port.likely, port.path))

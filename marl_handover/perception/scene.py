@@ -214,7 +214,7 @@ def arm_shapes(arm: ArmModel, base: SE2, joints_rad: ArrayLike, gripper_mm: floa
         colour = _FINGER if "finger" in link.name else _LINKS.get(link.name, _SILVER)
         for primitive in link.collisions:
             T = T_world_base @ frames[link.name] @ transform(primitive.xyz_mm, primitive.rpy_rad)
-            shapes.append(Shape(_moved(T, _outline(primitive)), colour))
+            shapes.append(Shape(_moved(T, outline(primitive)), colour))
     return shapes
 
 
@@ -310,7 +310,7 @@ def _ring(radius_mm: float) -> Floats:
     return radius_mm * np.column_stack([np.cos(angle), np.sin(angle)])
 
 
-def _outline(shape: Primitive) -> Floats:
+def outline(shape: Primitive) -> Floats:
     """Points (n, 3) whose convex hull is the shape, in its own frame; round ones from twelve sides."""
     if shape.kind == "box":
         signs = np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, -1).T

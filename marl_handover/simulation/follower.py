@@ -45,6 +45,7 @@ class ServoFollower:
         self._begin_s, self._steps, self._still = t_s, 0, 0
         self._last = servos(t_s)
         self._open_mm = cell.motion.finger_travel_mm - _OPEN_SLACK_MM
+        self._pin_mm = cell.model.cell.config.block.pin_diameter_mm / 2
         self._holding: set[int] = set()
         self._fine = False
 
@@ -85,7 +86,11 @@ class ServoFollower:
     def _look(self, state: ServoState) -> None:
         """Who holds the pin, and what touches what."""
         for arm, opening in enumerate(state.gripper_mm):
-            holds = opening < self._open_mm and self.cell.held(arm)
+            if opening < self._pin_mm:
+                holds = self.cell.grasp(arm)
+            else:
+                self.cell.release(arm)
+                holds = opening < self._open_mm and self.cell.held(arm)
             if holds and arm not in self._holding:
                 self.grasps.append((arm, self.now_s))
             (self._holding.add if holds else self._holding.discard)(arm)

@@ -215,6 +215,21 @@ class SimulatedCell:
         """Angle between the pin and the vertical."""
         return self.block.tilt_rad()
 
+    def grasp(self, arm: int) -> bool:
+        """The fingers of ``arm`` have closed: whether it holds the pin; rigidly, from now on, where friction alone does not do."""
+        if not self.held(arm):
+            return False
+        if (self._bonded[arm] or self._sticky[arm]) and arm not in self._bonds:
+            self.engine.bond(arm)
+            self._bonds.add(arm)
+        return True
+
+    def release(self, arm: int) -> None:
+        """The fingers of ``arm`` open: nothing holds the pin rigidly any more."""
+        if arm in self._bonds:
+            self._bonds.discard(arm)
+            self.engine.release(arm)
+
     def held(self, arm: int) -> bool:
         """Whether both fingers of ``arm`` press on the block or its pin; of a hand to which it sticks, whether it does."""
         if self._sticky[arm]:
@@ -279,18 +294,13 @@ class SimulatedCell:
 
     def _watch_grasp(self, arm: int, track: _Track, step: int, report: ArmReport) -> None:
         if step == track.closed_at:
-            report.grasped = self.held(arm)
+            report.grasped = self.grasp(arm)
             if report.grasped:
                 self._holding.add(arm)
-                if self._bonded[arm] or self._sticky[arm]:
-                    self.engine.bond(arm)
-                    self._bonds.add(arm)
         elif step == track.opens_at:
             report.kept = self.held(arm)
             self._holding.discard(arm)
-            if arm in self._bonds:
-                self._bonds.discard(arm)
-                self.engine.release(arm)
+            self.release(arm)
 
     def _over_pin(self, arm: int) -> bool:
         """Whether the grip of an arm is at the pin."""

@@ -142,4 +142,4 @@ def test_without_a_terminal_nobody_is_there(monkeypatch):
     monkeypatch.setattr("sys.stdin", open("/dev/null"))  # noqa: SIM115 - closed with the process
     assert not confirmed("Is the way free?")
     with pytest.raises(WorkFailed, match="terminal"):
-        TerminalOperator(CardConfig()).glue_cards()
+        TerminalOperator(CardConfig(), build_cell(cell_config("paper"))).glue_cards()

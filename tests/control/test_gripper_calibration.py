@@ -16,11 +16,18 @@ from marl_handover.control.calibration import RANGE_MM, GripperCalibration, plac
 from marl_handover.control.hardware_backend import HardwareBackend
 from marl_handover.control.settings import WatchConfig, twin_workcell
 from marl_handover.errors import CorruptFile, InvalidSetting
-from marl_handover.hardware.board_group import gripper_pulse_us
-from marl_handover.hardware.calibration import GRIPPERS_FILE, CalibrationProblem, save_grippers, shifted, with_grippers
-from marl_handover.hardware.settings import ARMS, GripperConfig
+from marl_handover.geometry.urdf import Gripper
+from marl_handover.hardware.calibration import CalibrationProblem
+from marl_handover.hardware.gripper import GRIPPERS_FILE, GripperMap, save_grippers, shifted, with_grippers
+from marl_handover.hardware.settings import ARMS, ArmWiring, GripperConfig, HardwareConfig
 
 PIN_MM = 2.5
+
+
+def pulse(gripper, opening_mm, pin_mm=PIN_MM):
+    """What a board's servo is told for fingers so far from closed."""
+    hardware = HardwareConfig(arms={"left": ArmWiring(gripper=gripper)})
+    return GripperMap(hardware, "left", Gripper()).closing_pulse(opening_mm, pin_mm)
 
 
 @pytest.fixture
@@ -59,7 +66,7 @@ def test_the_hand_is_found_that_holds_and_does_not_press_harder_than_it_must(han
     procedure.progress = lambda arm, further_mm, held: told.append((further_mm, held))
     grip = procedure.arm(1)
     truth = twin.electronics.servos(1)[-1].truth
-    closed_mm = (gripper_pulse_us(grip.gripper, 0.0, PIN_MM) - truth.zero_us) / truth.slope_us
+    closed_mm = (pulse(grip.gripper, 0.0) - truth.zero_us) / truth.slope_us
     assert 0.3 < PIN_MM / 2 - closed_mm < 1.3, "mm into the pin, for each finger"
     assert [held for _, held in told] == [False] * (grip.tries - 1) + [True]
     assert np.all(np.diff([further for further, _ in told]) > 0), "never closed further than it needed"
@@ -92,7 +99,7 @@ def test_a_shift_moves_every_pulse_alike_and_back(open_us, closed_us, further_mm
     assert moved.closed_us - moved.open_us == closed_us - open_us
     assert shifted(moved, -further_mm) == gripper
     # The old pulse for "further closed" is the new one for the same opening.
-    assert abs(gripper_pulse_us(moved, at_mm, PIN_MM) - gripper_pulse_us(gripper, at_mm - further_mm, PIN_MM)) <= 1
+    assert abs(pulse(moved, at_mm) - pulse(gripper, at_mm - further_mm)) <= 1
 
 
 def test_no_shift_goes_beyond_what_a_servo_takes():

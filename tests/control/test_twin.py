@@ -9,6 +9,7 @@ import pytest
 
 from marl_handover.arrays import wrap
 from marl_handover.config import MotionConfig
+from marl_handover.control.servo_calibration import card_place
 from marl_handover.control.settings import twin_workcell
 from marl_handover.control.twin import Twin
 from marl_handover.hardware.clock import VirtualClock
@@ -113,7 +114,7 @@ def test_cards_and_boards_are_seen_and_never_laid_exactly(twin):
     bare = twin.camera.read().image
     twin.glue_cards()
     assert (twin.camera.read().image != bare).mean() > 0.0
-    off = [np.linalg.norm(T[:3, 3] - twin.config.hand_markers.place_mm) for _, T in twin._cards]
+    off = [np.linalg.norm(T[:3, 3] - card_place(twin.model.arm, twin.config.hand_markers)) for _, T in twin._cards]
     assert all(0.0 < value < 2.0 for value in off)
     twin.take_cards_off()
     assert not twin._cards

@@ -177,7 +177,7 @@ def test_markers_are_numbered_on_and_people_are_told_of_all(config, tmp_path, ca
     assert CardConfig().numbers(3) == [2, 3, 4]
     assert CardConfig([7, 9, 8]).numbers(3) == [7, 9, 8]
     with pytest.raises(WorkFailed, match="marker 2 flat on the north hand, 3 on the west one, 4 on the east one"):
-        TerminalOperator(CardConfig(), NAMES).glue_cards()
+        TerminalOperator(CardConfig(), build_cell(cell_config("triangle")), NAMES).glue_cards()
     assert main(["calibrate", "what=sheets", *CELL, f"calibration={tmp_path}"]) == 0
     assert (tmp_path / "sheets" / "hands.pdf").is_file()
     assert main(["calibrate", "what=sheets", *CELL, f"calibration={tmp_path}", "hand_markers.ids=[2,3]"]) == 2

@@ -163,7 +163,7 @@ def test_a_stop_arrives_within_what_was_reckoned(armed, wired):
     for name, device in rig.cell.devices.items():
         device.advance(rig.clock.now_s())
         last_s = max(t_s for t_s, line in device.lines if b"STOP" in line)
-        assert last_s - began_s <= rig.driver.boards.stop_s(name, 115200) < 0.04
+        assert last_s - began_s <= rig.driver.boards.stop_s(name) < 0.04
 
 
 def test_the_log_goes_on_after_a_reconnection(armed):

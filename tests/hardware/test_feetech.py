@@ -146,7 +146,7 @@ def test_a_bus_finds_its_servos_and_reads_them(echo):
     bus, _, clock = made(echo=echo)
     with pytest.raises(WrongState, match="not connected"):
         _ = bus.wire
-    assert bus.connect(IDS) == dict.fromkeys(IDS, 777)
+    assert bus.open(IDS) == dict.fromkeys(IDS, 777)
     assert bus.echo is echo
     assert bus.read_all("present_position", IDS) == {number: 1000 + 100 * number for number in IDS}
     assert bus.read(3, "present_position") == 1300
@@ -162,7 +162,7 @@ def test_servos_are_streamed_and_read_back_two_hundred_times_a_second(count):
     """As the line allows: two arms on one bus, goals out and positions in, in virtual time."""
     ids = list(range(1, count + 1))
     bus, _, clock = made(ids=ids)
-    bus.connect(ids)
+    bus.open(ids)
     begun = clock.now_s()
     for _ in range(20):
         bus.write_all(("goal_position",), {number: (1000 + 100 * number,) for number in ids})
@@ -172,7 +172,7 @@ def test_servos_are_streamed_and_read_back_two_hundred_times_a_second(count):
 
 def test_what_is_written_is_confirmed_and_lasts():
     bus, device, _ = made()
-    bus.connect(IDS)
+    bus.open(IDS)
     assert bus.configure(2, {"p": 16, "return_delay": 0, "max_temperature": 65}) == ["p", "max_temperature"]
     before = len(device.lines)
     assert bus.configure(2, {"p": 16, "return_delay": 0, "max_temperature": 65}) == []
@@ -188,7 +188,7 @@ def test_what_is_written_is_confirmed_and_lasts():
 
 def test_a_register_that_does_not_keep_its_value_is_told_and_the_lock_is_shut():
     bus, device, _ = made()
-    bus.connect(IDS)
+    bus.open(IDS)
     taking = device.servos[0].take
     device.servos[0].take = lambda address, data: None if address == REGISTERS["phase"].address else taking(address, data)
     with pytest.raises(BadReply, match="phase of servo 1"):
@@ -201,7 +201,7 @@ def test_servos_that_do_not_answer_are_named_with_those_that_do(faults, gone):
     bus, _, clock = made(faults)
     left = ", ".join(str(number) for number in IDS if number not in gone) or "none"
     with pytest.raises(ServoMissing, match=f"no answer from servo {', '.join(map(str, gone))}; answering: {left}") as caught:
-        bus.connect(IDS)
+        bus.open(IDS)
     assert caught.value.servos == tuple(gone)
     assert clock.now_s() < 6.0
     with pytest.raises(WrongState):
@@ -211,7 +211,7 @@ def test_servos_that_do_not_answer_are_named_with_those_that_do(faults, gone):
 @pytest.mark.parametrize("faults", ["drop@0.2=0.3", "corrupt@0.2=0.02", "truncate@0.2=0.3", "late@0.2:0.5=0.02"])
 def test_damaged_answers_are_asked_for_again_and_never_believed(faults):
     bus, _, clock = made(faults, retries=12)
-    bus.connect(IDS)
+    bus.open(IDS)
     clock.until(0.3)
     for _ in range(30):
         assert bus.read_all("present_position", IDS) == {number: 1000 + 100 * number for number in IDS}
@@ -219,7 +219,7 @@ def test_damaged_answers_are_asked_for_again_and_never_believed(faults):
 
 def test_a_bus_that_falls_silent_is_missed_in_time():
     bus, _, clock = made("silent@1:1")
-    bus.connect(IDS)
+    bus.open(IDS)
     clock.until(1.1)
     begun = clock.now_s()
     with pytest.raises(ServoMissing):
@@ -233,7 +233,7 @@ def test_two_servos_of_one_id_are_noticed():
     bus, device, _ = made(ids=[1, 2, 2, 3])
     device.servos[2].put(2500.0)
     with pytest.raises((ServoMissing, DuplicateServo), match="servo 2"):
-        bus.connect([1, 2, 3])
+        bus.open([1, 2, 3])
 
 
 def test_one_id_that_answers_twice_is_told():
@@ -244,7 +244,7 @@ def test_one_id_that_answers_twice_is_told():
 
 def test_a_servo_with_trouble_still_answers_and_a_write_says_so():
     bus, _, clock = made("overload@1=2")
-    bus.connect(IDS)
+    bus.open(IDS)
     clock.until(1.1)
     assert bus.ping(2) == Status.OVERLOAD
     assert bus.read(2, "present_position") == 1200
@@ -258,15 +258,15 @@ def test_a_servo_with_trouble_still_answers_and_a_write_says_so():
 
 def test_a_cable_that_comes_out_is_a_lost_port():
     bus, _, clock = made("unplug@1:1")
-    bus.connect(IDS)
+    bus.open(IDS)
     clock.until(1.5)
     with pytest.raises(PortLost):
         bus.read(1, "present_position")
     clock.until(2.5)
-    assert bus.connect(IDS) == dict.fromkeys(IDS, 777)
+    assert bus.open(IDS) == dict.fromkeys(IDS, 777)
 
 
 def test_another_rate_is_silence():
     bus, _, _ = made(registers={"baud_rate": 4})
     with pytest.raises(ServoMissing, match="baud"):
-        bus.connect([1])
+        bus.open([1])

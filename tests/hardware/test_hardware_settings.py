@@ -14,13 +14,15 @@ from marl_handover.compose import compose, from_text, to_yaml
 from marl_handover.config import BlockConfig
 from marl_handover.errors import HandoverError, InvalidSetting, UnknownChoice
 from marl_handover.files import resource_path
-from marl_handover.hardware.board_group import Wiring, finger_mm, gripper_pulse_us
+from marl_handover.geometry.urdf import Gripper
+from marl_handover.hardware.board_group import Wiring
 from marl_handover.hardware.calibration import nominal_calibration
 from marl_handover.hardware.clock import VirtualClock
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.errors import PortNotFound
+from marl_handover.hardware.gripper import GripperMap
 from marl_handover.hardware.safety_filter import JointCommand
-from marl_handover.hardware.settings import ARMS, GripperConfig, HardwareConfig
+from marl_handover.hardware.settings import ARMS, HardwareConfig
 from marl_handover.hardware.transport import choose_port, list_serial_ports
 
 FILES = sorted(resource_path("configs/hardware").glob("*.yaml"))
@@ -114,12 +116,13 @@ def test_policies_are_chosen_from_a_list(change):
 
 
 def test_fingers_are_sent_into_the_pin_and_no_further():
-    gripper = GripperConfig()
-    assert gripper_pulse_us(gripper, 14.0, 2.5) == gripper.open_us
-    assert gripper_pulse_us(gripper, 20.0, 2.5) == gripper.open_us
-    closed = gripper_pulse_us(gripper, 0.0, 2.5)
-    assert finger_mm(gripper, closed) == pytest.approx(2.5 / 2 - gripper.preload_mm, abs=0.02)
-    assert gripper_pulse_us(GripperConfig(preload_mm=3.0), 0.0, 2.5) == gripper.closed_us
+    config = HardwareConfig()
+    gripper, pulses = config.arms["left"].gripper, GripperMap(config, "left", Gripper())
+    assert pulses.closing_pulse(14.0, 2.5) == gripper.open_us
+    assert pulses.closing_pulse(20.0, 2.5) == gripper.open_us
+    assert pulses.mm(pulses.closing_pulse(0.0, 2.5)) == pytest.approx(2.5 / 2 - gripper.preload_mm, abs=0.02)
+    gripper.preload_mm = 3.0
+    assert pulses.closing_pulse(0.0, 2.5) == gripper.closed_us
 
 
 @pytest.mark.parametrize(("preload_mm", "pin_mm"), [(1.25, 2.5), (3.0, 2.5), (0.6, 1.2), (0.25, 0.5)])
@@ -160,7 +163,7 @@ def test_wiring_translates_there_and_back(model):
     config = HardwareConfig()
     joints = np.array([joint.velocity for joint in model.arm.description.joints[:5]])
     calibrations = [nominal_calibration(config, arm, model.arm) for arm in ARMS]
-    wiring = Wiring(config, calibrations, 2.5, joints)
+    wiring = Wiring(config, calibrations, model.arm.description.gripper, 2.5, joints)
     q = [0.3, 2.0, -2.1, 0.4, -0.2]
     found = wiring.pulses([JointCommand(1, q, 9.0)])
     assert set(found["main"]) == {16, 17, 18, 19, 20, 21}

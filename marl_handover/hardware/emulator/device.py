@@ -167,9 +167,11 @@ class SerialDevice(ABC):
         self.advance(t_s)
         return sum(at_s <= t_s for at_s, _ in self._outgoing)
 
-    def next_event_s(self) -> float | None:
-        """When something may happen next that the computer could notice; None if nothing is under way."""
-        times = [queue[0][0] for queue in (self._incoming, self._outgoing) if queue] + [edge[0] for edge in self._edges[:1]]
+    def next_event_s(self, size: int = 1) -> float | None:
+        """When something may happen next that somebody could notice who waits for ``size`` bytes; None if nothing is under way."""
+        times = [self._incoming[0][0]] if self._incoming else []
+        times += [self._outgoing[min(size, len(self._outgoing)) - 1][0]] if self._outgoing else []
+        times += [edge[0] for edge in self._edges[:1]]
         return min(times) if times else None
 
     def sending_until_s(self) -> float:
@@ -381,6 +383,21 @@ class EmulatedCell:
         self._positions(t_s)
         for servo, angle in zip(self.servos(arm), np.asarray(joints_rad, float), strict=False):
             servo.put(float(angle))
+
+    def put_hand(self, arm: int, gripper_mm: float, t_s: float) -> None:
+        """Open or close a hand by hand."""
+        self._positions(t_s)
+        self.servos(arm)[-1].put(gripper_mm)
+
+    def limp_arms(self, t_s: float) -> list[int]:
+        """Arms that somebody has to put where they should stand: all, if no servo gets a pulse."""
+        held = any(any(device.outputs_us(t_s)) for device in self.devices.values())
+        return [] if held else list(range(len(self.config.arms)))
+
+    def told(self, t_s: float) -> Floats:
+        """Pulses (num_arms, 5) that the joints' servos get; 0: none."""
+        outputs = {name: device.outputs_us(t_s) for name, device in self.devices.items()}
+        return np.array([[outputs[wiring.board][channel] for channel in wiring.channels] for wiring in self.config.arms.values()])
 
     def servos(self, arm: int) -> list[Servo]:
         """An arm's servos, the gripper's last."""

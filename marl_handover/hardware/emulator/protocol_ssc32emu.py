@@ -94,7 +94,7 @@ class Serial(SerialBase):
             data += self._device.read(now_s, size - len(data))
             if len(data) == size or (end_s is not None and now_s >= end_s):
                 break
-            next_s = self._device.next_event_s()
+            next_s = self._device.next_event_s(size - len(data))
             wait_s = 0.01 if next_s is None else max(next_s - now_s, 1e-6)
             self._clock.sleep_s(wait_s if end_s is None else min(wait_s, end_s - now_s))
         return bytes(data)

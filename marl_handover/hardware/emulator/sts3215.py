@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from marl_handover.hardware.feetech import (
-    COUNTS,
     FIRST_RAM,
     MEMORY,
     MODEL,
@@ -20,6 +19,7 @@ from marl_handover.hardware.feetech import (
     decoded,
     encoded,
 )
+from marl_handover.hardware.settings import COUNTS
 
 STEP_S = 0.002
 """Longest step of a servo's motion."""
@@ -35,6 +35,21 @@ IDLE_NM = 0.05
 
 FACTORY_P = 32
 LAG_S = 0.02
+_MOVING = (
+    *("p", "torque_limit", "max_torque", "overload_torque", "overload_threshold", "overload_time", "unloading", "phase", "torque_enable"),
+    *("dead_zone_cw", "dead_zone_ccw", "max_acceleration", "acceleration", "goal_speed", "max_speed"),
+)
+"""Registers that say how it moves."""
+
+_MOVING = (
+    *("p", "torque_limit", "max_torque", "overload_torque", "overload_threshold", "overload_time", "unloading", "phase", "torque_enable"),
+    *("dead_zone_cw", "dead_zone_ccw", "max_acceleration", "acceleration", "goal_speed", "max_speed"),
+)
+"""Registers that say how it moves."""
+
+_STILL = 1e-3
+"""Counts in a step below which a shaft is at rest."""
+
 FASTEST = 3400.0
 """Steps per second without load."""
 
@@ -73,12 +88,13 @@ class Sts3215Truth:
     """What a servo is really like.
 
     ``low`` and ``high``: end stops in counts of the encoder; ``play`` in counts: the whole way that the shaft has free of the motor;
-    ``supply_v`` and ``ambient_c``: volts and degrees Celsius where it stands.
+    ``stiffness``: of the usual one, at equal gains; ``supply_v`` and ``ambient_c``: volts and degrees Celsius where it stands.
     """
 
     low: float = 0.0
     high: float = COUNTS - 1.0
     play: float = 0.0
+    stiffness: float = 1.0
     supply_v: float = 7.4
     ambient_c: float = 30.0
 
@@ -96,6 +112,8 @@ class Sts3215:
     def __init__(self, servo: int, at: float = COUNTS / 2, truth: Sts3215Truth | None = None, registers: Mapping[str, int] | None = None):
         self.truth = truth or Sts3215Truth()
         self.at, self.load_nm, self.jammed = float(at), 0.0, False
+        self._resting: tuple[float, ...] | None = None  # in what state another step would change nothing
+        self._told = False
         self._stored = _factory({"id": servo, **(registers or {})})
         self._pending: list[tuple[int, bytes]] = []
         self._motor = self._motor_goal = self.at
@@ -105,20 +123,28 @@ class Sts3215:
 
     def __getitem__(self, name: str) -> int:
         register = REGISTERS[name]
-        return decoded(name, bytes(self.memory[register.address : register.address + register.size]))
+        if not register.writable and not self._told:
+            self._tell()
+        return decoded(name, bytes(self._memory[register.address : register.address + register.size]))
 
     def __setitem__(self, name: str, value: int) -> None:
         register = REGISTERS[name]
-        self.memory[register.address : register.address + register.size] = encoded(name, value)
+        self._memory[register.address : register.address + register.size] = encoded(name, value)
+
+    def read(self, address: int, size: int) -> bytes:
+        """Registers from an address on; beyond the last there are zeros."""
+        if not self._told:
+            self._tell()
+        return bytes(self._memory[address : address + size]).ljust(size, b"\0")
 
     def power_up(self) -> None:
         """Forget all but EEPROM; the shaft stays where it is."""
-        self.memory = bytearray(self._stored)
+        self._memory = bytearray(self._stored)
         self._pending.clear()
         self._motor = self._motor_goal = self.at
         self._speed, self._strained_s, self._overload = 0.0, 0.0, 0.0
         self["torque_limit"], self["lock"] = self["max_torque"], 1
-        self._tell()
+        self._changed()
 
     def take(self, address: int, data: bytes) -> None:
         """Write registers from an address on; read-only ones stay as they are."""
@@ -129,7 +155,7 @@ class Sts3215:
         for offset, byte in enumerate(data):
             where = address + offset
             if where < MEMORY and where not in fixed:
-                self.memory[where] = byte
+                self._memory[where] = byte
                 if where < FIRST_RAM and unlocked:
                     self._stored[where] = byte
         if REGISTERS["torque_enable"].address in touched:
@@ -139,7 +165,7 @@ class Sts3215:
                 self._motor, self._speed = self.at, 0.0
             self["torque_enable"] = 1
             self._motor_goal = self._allowed(self["goal_position"])
-        self._tell()
+        self._changed()
 
     def note(self, address: int, data: bytes) -> None:
         """Keep a write for :meth:`act`."""
@@ -161,19 +187,26 @@ class Sts3215:
     def put(self, at: float) -> None:
         """Turn the shaft by hand, to counts of the encoder; a servo that holds turns back."""
         self.at = min(max(at, self.truth.low), self.truth.high)
+        self._resting, self._told = None, False
 
     def latch_overload(self) -> None:
         """An overload as after too long a strain."""
         self._overload = math.copysign(1.0, self._motor_goal - self.at)
-        self._tell()
+        self._changed()
 
     def step(self, duration_s: float) -> None:
         """Move on."""
         while duration_s > 0:
+            state = (self.at, self._motor, self.load_nm, float(self.jammed), self._strained_s)
+            if state == self._resting:
+                return
             part = min(duration_s, STEP_S)
             self._move(part)
             duration_s -= part
-        self._tell()
+            self._told = False
+            now = (self.at, self._motor, self.load_nm, float(self.jammed), self._strained_s)
+            still = self._motor == self._motor_goal and abs(now[0] - state[0]) < _STILL and now[1:] == state[1:]
+            self._resting = now if still else None
 
     @property
     def holds(self) -> bool:
@@ -189,13 +222,18 @@ class Sts3215:
             register = REGISTERS["homing_offset"]
             if self["lock"] == 0:
                 where = slice(register.address, register.address + register.size)
-                self._stored[where] = self.memory[where]
+                self._stored[where] = self._memory[where]
             self["torque_enable"] = was
         elif not wanted:
             self._overload = self._strained_s = 0.0
         elif not was:
             self._motor = self._motor_goal = self.at
             self._speed = 0.0
+
+    def _changed(self) -> None:
+        """Registers are not what they were: look at them anew."""
+        self._resting, self._told = None, False
+        self._now = {name: self[name] for name in _MOVING}
 
     def _allowed(self, goal: int) -> float:
         """Counts of the encoder that a goal means."""
@@ -205,19 +243,19 @@ class Sts3215:
         return float(goal + self["homing_offset"])
 
     def _move(self, duration_s: float) -> None:
-        strength = STALL_NM * self.truth.supply_v / STALL_V * min(self["torque_limit"], self["max_torque"]) / 1000
+        strength = STALL_NM * self.truth.supply_v / STALL_V * min(self._now["torque_limit"], self._now["max_torque"]) / 1000
         if self._overload and math.copysign(1.0, self._motor_goal - self.at) == self._overload:
-            strength *= self["overload_torque"] / 100
-        if not self.holds:
+            strength *= self._now["overload_torque"] / 100
+        if self._now["torque_enable"] != 1:
             self._motor = self._motor_goal = self.at
             self._speed = 0.0
             self._fall(self.load_nm, duration_s)
             self._drive, self._velocity = 0.0, 0.0
             return
         self._profile(duration_s)
-        stiff = STIFFNESS_NM * self["p"] / FACTORY_P
+        stiff = STIFFNESS_NM * self.truth.stiffness * self._now["p"] / FACTORY_P
         error = self._motor - self.at
-        zone = self["dead_zone_cw"] if error < 0 else self["dead_zone_ccw"]
+        zone = self._now["dead_zone_cw"] if error < 0 else self._now["dead_zone_ccw"]
         wanted = 0.0 if abs(error) <= zone else stiff * error
         drive = max(-strength, min(strength, wanted))
         before = self.at
@@ -235,22 +273,26 @@ class Sts3215:
                     self.put(self.at + max(-reach, min(reach, gap * -math.expm1(-duration_s / LAG_S))))
         self._velocity = (self.at - before) / duration_s
         self._drive = drive / max(STALL_NM * self.truth.supply_v / STALL_V, 1e-9)
-        self._strain(abs(drive) >= strength * self["overload_threshold"] / 100, duration_s, drive)
+        self._strain(abs(drive) >= strength * self._now["overload_threshold"] / 100, duration_s, drive)
 
     def _strain(self, strained: bool, duration_s: float, drive: float) -> None:
         """Too much for too long, and the servo lets go of most of its torque until it is switched off or turns back."""
         if self._overload and drive * self._overload < 0:
             self._overload = 0.0
         self._strained_s = self._strained_s + duration_s if strained else 0.0
-        if self["overload_time"] and self._strained_s >= self["overload_time"] * 0.01 and self["unloading"] & Status.OVERLOAD:
+        if (
+            self._now["overload_time"]
+            and self._strained_s >= self._now["overload_time"] * 0.01
+            and self._now["unloading"] & Status.OVERLOAD
+        ):
             self._overload = math.copysign(1.0, drive)
 
     def _profile(self, duration_s: float) -> None:
         """The motor's own set point goes to the goal, by a trapezoid of acceleration and speed."""
-        most = self["max_acceleration"]
-        asked = self["acceleration"]
+        most = self._now["max_acceleration"]
+        asked = self._now["acceleration"]
         rate = 100.0 * (asked if 0 < asked <= most else most)
-        top = abs(self["goal_speed"]) or (50.0 * self["max_speed"] if self["phase"] & 8 else 0.0)
+        top = abs(self._now["goal_speed"]) or (50.0 * self._now["max_speed"] if self._now["phase"] & 8 else 0.0)
         left = self._motor_goal - self._motor
         wanted = math.copysign(min(top, math.sqrt(2 * rate * abs(left))), left)
         change = max(-rate * duration_s, min(rate * duration_s, wanted - self._speed))
@@ -268,6 +310,7 @@ class Sts3215:
 
     def _tell(self) -> None:
         """Put what is measured into the registers."""
+        self._told = True
         count = round(self.at - self["homing_offset"])
         self["present_position"] = max(-32767, min(32767, count if self["phase"] & 16 else count % COUNTS))
         self["present_speed"] = max(-32767, min(32767, round(self._velocity)))
@@ -277,9 +320,9 @@ class Sts3215:
         self["present_current"] = round(abs(self._drive) * 2000 / 6.5)
         self["moving"] = int(self.holds and abs(self._speed) > 0)
         status = Status(0)
-        if not self["min_voltage"] <= self["present_voltage"] <= self["max_voltage"]:
+        if not self["min_voltage"] <= round(10 * self.truth.supply_v) <= self["max_voltage"]:
             status |= Status.VOLTAGE
-        if self["present_temperature"] > self["max_temperature"]:
+        if round(self.temperature_c) > self["max_temperature"]:
             status |= Status.TEMPERATURE
         if self._overload:
             status |= Status.OVERLOAD
