@@ -13,7 +13,7 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from marl_handover.arrays import Array, as_kind, namespace, one_where
+from marl_handover.arrays import Array, as_kind, one_where
 from marl_handover.cell import NO_ARM, Cell, load_cell
 from marl_handover.config import CellConfig, TaskConfig, require_choice
 from marl_handover.envs.top_view import TopView, Window, no_window_because
@@ -21,7 +21,7 @@ from marl_handover.errors import GoalInObservation, InvalidSetting, NotFinite
 from marl_handover.motion.path_length_table import motion_cost
 from marl_handover.schema import with_settings
 from marl_handover.task.episode import Stepped, advance
-from marl_handover.task.observations import observation_size, observe
+from marl_handover.task.observations import last_arm, observation_size, observe
 from marl_handover.task.problems import ProblemSource, sample_poses
 from marl_handover.task.rules import Command, Outcome, Rules, Verdict
 
@@ -225,12 +225,9 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
         """
         if self.rules.config.layout != LAYOUT:
             raise InvalidSetting("layout", self.rules.config.layout, f"{LAYOUT!r} to compute features from")
-        xp, last = namespace(observation["achieved_goal"]), observation["observation"][..., 3:]
         unit = as_kind(self._unit, observation["achieved_goal"])
-        moved = last[..., 0] != 0 if last.shape[-1] == 1 else (last > 0).any(-1)
-        which = xp.where(last[..., 0] > 0, 1, 0) if last.shape[-1] == 1 else xp.argmax(last, -1)
-        previous_arm = xp.where(moved, which, NO_ARM)
-        return observe(self.rules, layout, observation["achieved_goal"] * unit, observation["desired_goal"] * unit, previous_arm)
+        pose, goal = observation["achieved_goal"] * unit, observation["desired_goal"] * unit
+        return observe(self.rules, layout, pose, goal, last_arm(observation["observation"]))
 
     def _judged(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Verdict:
         """The verdict (...) on transfers that ``info`` tells of, had ``desired_goal`` (..., 3) been the goal."""

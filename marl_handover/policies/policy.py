@@ -4,10 +4,13 @@ A policy answers two calls: ``policy(observation)`` takes one observation of the
 ``previous_arm`` 0 none, 1 L, 2 R, or 1 + the arm's index) and returns its action (``final``, ``arm``, ``place``, and ``receiver`` unless
 there are two arms); ``policy.act(pose, goal, previous_arm)`` takes batches (n, 3), (n, 3), (n,) (-1 none, 0 L, 1 R), or single problems
 (3,), (3,), (), and returns actions (n, size) or (size,), 4 numbers for a pair (:mod:`marl_handover.task.actions`).
+
+``policy.predict(observation)`` is what Stable-Baselines3's models have: it takes what any environment of the package shows.
 """
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
@@ -16,9 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from marl_handover.arrays import Floats
-from marl_handover.errors import WorkFailed, listed
+from marl_handover.arrays import Floats, as_kind
+from marl_handover.errors import InvalidSetting, WorkFailed, listed
 from marl_handover.task.actions import action_of, choices_of
+from marl_handover.task.observations import last_arm
 from marl_handover.task.planner import ExactPlanner
 from marl_handover.task.rules import Outcome, Rules
 
@@ -101,6 +105,47 @@ class SupervisorPolicy(ABC):
         if np.isnan(action).any():
             raise NobodyMoves(self.name)
         return choices_of(action, self.rules.cell.num_arms)
+
+    def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True) -> tuple[Any, Any]:
+        """The action for what an environment shows, and ``state`` as it was: these policies remember nothing.
+
+        Args:
+            observation: of the Gymnasium environments, one cell or many (poses in mm and rad), with the layout ``object``; of the batched
+                TorchRL environment; or of the AEC supervisor.
+            state: handed back.
+            episode_start: not looked at.
+            deterministic: True; these policies do not draw.
+
+        Returns:
+            The environment's action (..., size), a tensor where the observation holds tensors; of the AEC supervisor a mapping.
+
+        Raises:
+            InvalidSetting: for another observation, or ``deterministic=False``.
+            NobodyMoves: it wants no arm to move.
+        """
+        if not deterministic:
+            raise InvalidSetting("deterministic", deterministic, f"True: {self.name} always says what it holds for best")
+        if isinstance(observation, Mapping) and "state" in observation:
+            return self(observation), state
+        try:
+            shown = [observation[key] for key in ("achieved_goal", "desired_goal")]
+            last = observation["previous_arm"][..., 0] if "previous_arm" in observation else last_arm(observation["observation"])
+        except (KeyError, TypeError, IndexError) as error:
+            forms = "achieved_goal, desired_goal and observation or previous_arm; or state, goal and previous_arm"
+            raise InvalidSetting("observation", observation, f"a mapping with {forms}") from error
+        pose, goal = (np.asarray(each, np.float64) for each in shown)
+        action = self.act(pose, goal, np.asarray(last, np.int64))
+        if np.isnan(action).any():
+            raise NobodyMoves(self.name)
+        return as_kind(action, shown[0]), state
+
+    def __repr__(self) -> str:
+        """What it is, and where it acts."""
+        config = self.rules.config
+        return (
+            f"{type(self).__name__}({self.name!r}, architecture={config.architecture!r}, cell={self.rules.cell.config.name!r}, "
+            f"epsilon_deg={math.degrees(self.rules.epsilon_rad):g})"
+        )
 
 
 class ShieldedPolicy(SupervisorPolicy):

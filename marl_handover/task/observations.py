@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from marl_handover.arrays import Array, namespace
+from marl_handover.cell.symmetry import NO_ARM
 from marl_handover.config import LAYOUTS
 from marl_handover.task.rules import Rules
 
@@ -98,6 +99,14 @@ def _previous(rules: Rules, like: Array, previous_arm: Array) -> list[Array]:
     if count == 2:
         return [xp.where(previous_arm < 0, 0 * one, xp.where(previous_arm > 0, one, -one))]
     return [xp.where(previous_arm == arm, one, 0 * one) for arm in range(count)]
+
+
+def last_arm(shown: Array) -> Array:
+    """Which arm moved last, int (...), -1 for none, of vectors (..., size) in the layout ``object``."""
+    xp, last = namespace(shown), shown[..., len(OBJECT_FIELDS) - 1 :]
+    if last.shape[-1] == 1:
+        return xp.where(last[..., 0] == 0, NO_ARM, xp.where(last[..., 0] > 0, 1, 0))
+    return xp.where((last > 0).any(-1), xp.argmax(last, -1), NO_ARM)
 
 
 def _raw(rules: Rules, pose: Array, goal: Array, previous_arm: Array, epsilon_rad: Array | float) -> Array:
