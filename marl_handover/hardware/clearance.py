@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from marl_handover.arrays import Floats
 from marl_handover.cell.build import CellModel
 from marl_handover.compiled import compiled
+from marl_handover.geometry.arm_model import ArmModel
 from marl_handover.geometry.capsules import block_capsules, capsule_pairs, joints_before
 from marl_handover.geometry.kernels import FAR_MM, broad_phase, closest_points
 from marl_handover.geometry.urdf import ARM_JOINTS
@@ -43,7 +44,8 @@ class Shapes(NamedTuple):
     ``pivots`` (6, 3): origins in mm of the base and the five joints' frames at zero. ``capsules`` (K, 9): number of joints before it, two
     end points in the frame of the last of them, radius, what it is held against. ``pairs`` (P, 2): those that belong to bodies which are
     not neighbours, the one with fewer joints before it first. ``levers`` (K, 5): bounds in mm on how far from each joint's axis any point
-    of the segment is, 0 where the joint does not move it. ``reach`` (5,): the greatest of these.
+    of the segment is, 0 where the joint does not move it. ``reach`` (5,): the greatest of these. ``roll`` (3, 3): its first column is the
+    axis of the last joint with all joints at zero, which is along x only of a hand that is level where it picks.
     """
 
     pivots: Floats
@@ -51,6 +53,7 @@ class Shapes(NamedTuple):
     pairs: Ints
     levers: Floats
     reach: Floats
+    roll: Floats
 
 
 def arm_shapes(model: CellModel, holding: bool = False) -> Shapes:
@@ -75,8 +78,21 @@ def arm_shapes(model: CellModel, holding: bool = False) -> Shapes:
         rows += block
     packed = np.array(rows, float)
     pairs = [(a, b) if packed[a, 0] <= packed[b, 0] else (b, a) for a, b in pairs]
-    levers = _levers(pivots, packed)
-    return Shapes(pivots, packed, np.array(pairs, np.int64).reshape(-1, 2), levers, levers.max(axis=0))
+    roll = _roll_frame(model.arm)
+    levers = _levers(pivots, packed, roll)
+    return Shapes(pivots, packed, np.array(pairs, np.int64).reshape(-1, 2), levers, levers.max(axis=0), roll)
+
+
+def _roll_frame(arm: ArmModel) -> Floats:
+    """See :attr:`Shapes.roll`."""
+    turned = arm.fk(np.array([0.0, 0.0, 0.0, 0.0, 0.5]))[:3, :3] @ arm.fk(np.zeros(5))[:3, :3].T
+    axis = np.array([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
+    if not axis.any():
+        return np.eye(3)  # an arm whose last joint is fixed
+    axis /= np.linalg.norm(axis)
+    left = np.array([0.0, 1.0, 0.0]) - axis[1] * axis
+    left /= np.linalg.norm(left)
+    return np.column_stack([axis, left, np.cross(axis, left)])
 
 
 def still(joints_rad: ArrayLike) -> Floats:
@@ -95,7 +111,7 @@ def _block_rows(model: CellModel, grip_mm: Floats) -> list[list[float]]:
     return [*rows, [5.0, *bottom, *top, block.side_mm / 2 * math.sqrt(2), DISC]]
 
 
-def _levers(pivots: Floats, capsules: Floats) -> Floats:
+def _levers(pivots: Floats, capsules: Floats, roll: Floats) -> Floats:
     """See :class:`Shapes`; a disc's are of its rim."""
     levers = np.zeros((len(capsules), 5))
     arms = np.linalg.norm(np.diff(pivots, axis=0), axis=1)
@@ -104,8 +120,9 @@ def _levers(pivots: Floats, capsules: Floats) -> Floats:
         rim = shape[7] if shape[8] == DISC else 0.0
         for joint in range(1, level + 1):
             row[joint - 1] = arms[joint:level].sum() + np.linalg.norm(ends, axis=1).max() + rim
-        if level == 5:  # about x
-            row[4] = np.hypot(ends[:, 1], ends[:, 2]).max() + rim
+        if level == 5:  # about the roll axis
+            _, left, up = (ends @ roll).T
+            row[4] = np.hypot(left, up).max() + rim
         if level == 1:  # about z, as below
             row[0] = np.hypot(ends[:, 0], ends[:, 1]).max() + rim
         if level >= 2:
@@ -116,7 +133,8 @@ def _levers(pivots: Floats, capsules: Floats) -> Floats:
 @compiled
 def place(q: Floats, shapes: Shapes, x: float, y: float, facing: float, out: Floats) -> None:
     """Fill ``out`` (K, 10) with the placed segments, rows as in the planner's kernels, of an arm at joints ``q`` (5,), base at (x, y)."""
-    pivots, capsules = shapes.pivots, shapes.capsules
+    pivots, capsules, B = shapes.pivots, shapes.capsules, shapes.roll
+    level_hand = B[0, 0] == 1.0
     R, p = np.empty((6, 3, 3)), np.empty((6, 3))
     cf, sf = math.cos(facing), math.sin(facing)
     R[0] = np.eye(3)
@@ -133,8 +151,15 @@ def place(q: Floats, shapes: Shapes, x: float, y: float, facing: float, out: Flo
                 R[level, row, 0], R[level, row, 1], R[level, row, 2] = c * a + s * b, c * b - s * a, d
             elif level < 5:  # about -y: positive lifts
                 R[level, row, 0], R[level, row, 1], R[level, row, 2] = c * a + s * d, b, c * d - s * a
-            else:  # about x
+            elif level_hand:  # about x
                 R[level, row, 0], R[level, row, 1], R[level, row, 2] = a, c * b + s * d, c * d - s * b
+            else:  # about the first column of B
+                u = a * B[0, 0] + b * B[1, 0] + d * B[2, 0]
+                v = a * B[0, 1] + b * B[1, 1] + d * B[2, 1]
+                w = a * B[0, 2] + b * B[1, 2] + d * B[2, 2]
+                v, w = c * v + s * w, c * w - s * v
+                for axis in range(3):
+                    R[level, row, axis] = u * B[axis, 0] + v * B[axis, 1] + w * B[axis, 2]
     for k in range(capsules.shape[0]):
         level, square = int(capsules[k, 0]), 0.0
         for row in range(3):

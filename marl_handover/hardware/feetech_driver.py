@@ -37,7 +37,7 @@ _MIN_SPEED, _SPARE = 120, 1.3
 """Counts per second that a servo may always use, and how much faster than its set point it may be, to catch up."""
 
 _MOVE = ("goal_position", "goal_time", "goal_speed")
-_STATE = ("torque_enable", "goal_position", "present_position", "status")
+_STATE = ("torque_enable", "goal_position", "present_position", "status", "present_speed")
 _LONGEST_BYTES = 400
 _PHASE_WRAPS = 16
 
@@ -104,6 +104,7 @@ class FeetechDriver(FeetechBus):
         self._trims: dict[int, float] = {}
         self._untried: set[int] = set()
         self._seen: dict[int, int] = {}
+        self._limits: dict[int, tuple[float, float]] = {}
 
     def connect(self) -> None:
         """Find the servos, see that they are what they should be, and set what lasts where it differs.
@@ -170,10 +171,10 @@ class FeetechDriver(FeetechBus):
             present = self._well(listed)  # a damaged answer may look like a whole one: bad news is believed when it comes twice
         for servo in listed:
             if servo in self._untried and servo not in self._grippers:
-                self._learn(servo, present[servo])
+                self._learn(servo, *present[servo])
 
-    def _well(self, listed: Sequence[int]) -> dict[int, int]:
-        """Where servos stand. Raises as :meth:`require_pulses`."""
+    def _well(self, listed: Sequence[int]) -> dict[int, tuple[int, int]]:
+        """Where servos stand, and their speeds. Raises as :meth:`require_pulses`."""
         state = self.read_group(_STATE, listed)
         now_s = self._clock.now_s()
         limp = [servo for servo in listed if not state[servo][0]]
@@ -186,7 +187,11 @@ class FeetechDriver(FeetechBus):
         for servo in listed:
             if servo not in self._grippers and servo in self._courses:
                 self._compare(servo, state[servo][2], now_s)
-        return {servo: state[servo][2] for servo in listed}
+        return {servo: (state[servo][2], state[servo][4]) for servo in listed}
+
+    def keep_within(self, limits: Mapping[int, tuple[float, float]]) -> None:
+        """From now on no servo is sent beyond these counts, but for what it sags, unless it is told to."""
+        self._limits = dict(limits)
 
     def note_readback(self, pulses: Mapping[int, int]) -> None:
         """Take readings of servos that stand still for where they were sent."""
@@ -209,7 +214,7 @@ class FeetechDriver(FeetechBus):
             self.write_all(("torque_enable",), {servo: (0,) for servo in troubled})
         goals = {}
         for servo, pulse in pulses.items():
-            holds, goal, _, status = state[servo]
+            holds, goal, _, status, _ = state[servo]
             kept = goal if holds and not status and abs(goal - pulse) <= self._most_trim else pulse
             goals[servo] = kept
         self._goals.update(goals)
@@ -233,7 +238,8 @@ class FeetechDriver(FeetechBus):
             self._courses[servo].append(course)
             most = (speeds or {}).get(servo, COUNTS)
             speed = min(max(math.ceil(_SPARE * max(course.speed, before)), _MIN_SPEED), max(most, 1))
-            self._goals[servo] = self._goal(servo, pulse + self._lead(course))
+            low, high = self._limits.get(servo, (-math.inf, math.inf))
+            self._goals[servo] = self._goal(servo, min(max(pulse + self._lead(course), min(low, pulse)), max(high, pulse)))
             self._untried.add(servo)
             goals[servo] = (self._goals[servo], 0, speed)
         return self._send(_MOVE, goals)
@@ -311,7 +317,7 @@ class FeetechDriver(FeetechBus):
                 raise ServoFault(self.name, servo, f"{words(Status.VOLTAGE)}: {volts:g} V, made for {low:g} to {high:g} V")
 
     def _require_well(self, servos: Sequence[int]) -> None:
-        for servo, (_, _, _, status) in self.read_group(_STATE, servos).items():
+        for servo, (_, _, _, status, _) in self.read_group(_STATE, servos).items():
             if status:
                 raise ServoFault(self.name, servo, words(Status(status)))
 
@@ -319,8 +325,12 @@ class FeetechDriver(FeetechBus):
         return self._courses[servo][-1].at(t_s)
 
     def _lead(self, course: _Course) -> float:
-        """How much further a servo is sent than where it is to be when a course ends, for it brakes early enough to stop at its goal."""
-        return math.copysign(course.speed**2 / (200.0 * self._settings.acceleration), course.target - course.start)
+        """How much further a servo is sent than where it is to be when a course ends, for it brakes early enough to stop at its goal.
+
+        If nothing follows, because the host died, it goes on by so much: hence the bound.
+        """
+        further = min(course.speed**2 / (200.0 * self._settings.acceleration), self._settings.lead_deg * COUNTS / 360)
+        return math.copysign(further, course.target - course.start)
 
     def _goal(self, servo: int, pulse: float) -> int:
         unit = PROTOCOLS["feetech"]
@@ -336,13 +346,13 @@ class FeetechDriver(FeetechBus):
             wanted = (min(places), max(places))
             raise ServoAstray(self.name, servo, present, wanted, self._most_off)
 
-    def _learn(self, servo: int, present: int) -> None:
-        """Aim further next time by what a servo lacks, the less the faster it goes. What was learnt is first tried out."""
+    def _learn(self, servo: int, present: int, speed: int) -> None:
+        """Aim further next time by what a servo lacks, the less the faster it goes, or should go. What was learnt is first tried out."""
         self._untried.discard(servo)
         then_s = self._clock.now_s() - LAG_S
         courses = self._courses[servo]
         course = next((course for course in reversed(courses) if course.begin_s <= then_s), courses[0])
-        share = self._settings.trim_share / (1 + (course.speed / _SLOW) ** 2)
+        share = self._settings.trim_share / (1 + (max(course.speed, abs(speed)) / _SLOW) ** 2)
         self._trims[servo] = self._bounded(self._trims.get(servo, 0.0) + share * (course.at(then_s) - present))
 
     def _bounded(self, trim: float) -> float:

@@ -53,6 +53,7 @@ class Reason(enum.StrEnum):
     GRIPPER = "gripper"
     STEP = "step"
     SPEED = "speed"
+    SPEED_CHANGE = "speed change"
     TABLE = "table"
     ITSELF = "itself"
     OTHER_ARM = "other arm"
@@ -92,6 +93,12 @@ class _Held(NamedTuple):
             return self.target
         return self.start + (t_s - self.begin_s) / (self.end_s - self.begin_s) * (self.target - self.start)
 
+    def speed_rad_s(self, t_s: float) -> Floats:
+        """Of the joints (5,), as sent; a servo is not at rest as soon as its move is over, nor is the next one sent at that very moment."""
+        if not self.begin_s <= t_s < self.end_s + LAG_S or self.end_s <= self.begin_s:
+            return np.zeros(5)
+        return (self.target - self.start)[:5] / (self.end_s - self.begin_s)
+
     def way(self, now_s: float, aim: Floats | None) -> Floats:
         """All that the arm may still do, as a way (3, 6) of :mod:`~marl_handover.hardware.clearance`, if it is sent to ``aim`` (6,) now."""
         late = self.at(now_s - LAG_S)
@@ -119,6 +126,7 @@ class SafetyFilter:
         speeds = [model.arm.description.joint(name).velocity for name in ARM_JOINTS]
         self.speed_rad_s = config.gate.speed_share * np.array(speeds)
         self._speed = np.append(self.speed_rad_s, config.gate.finger_mm_s)
+        self._most_change_deg_s = config.bus.speed_change_deg_s if config.protocol == "feetech" else math.inf
         self._held: list[_Held | None] = [None] * len(self._bases)
         # Compiled, or loaded, here: not between a plan and its first command.
         alone_mm(still(np.zeros(5)), self._shapes[0], np.full(3, -FAR_MM), np.empty(3))
@@ -162,7 +170,9 @@ class SafetyFilter:
             if held is None:
                 raise self._rejected(Reason.NO_REFERENCE, arm, "its position", "unknown", "an arm that was armed in its parked pose")
             self._check_ends(arm, target)
-            self._check_way(arm, np.abs(target - held.at(now_s)), duration_s)
+            change = target - held.at(now_s)
+            self._check_way(arm, np.abs(change), duration_s)
+            self._check_speed_change(arm, change[:5] / duration_s - held.speed_rad_s(now_s))
         self.check_room(targets, now_s)
 
     def check_stand(self, commands: Sequence[JointCommand]) -> None:
@@ -266,6 +276,14 @@ class SafetyFilter:
             if worst < 5:
                 speed, limit, unit = math.degrees(speed), math.degrees(limit), "degrees/s"
             raise self._rejected(Reason.SPEED, arm, f"the speed of {_ANGLES[worst]}", float(speed), f"up to {limit:.1f} {unit}")
+
+    def _check_speed_change(self, arm: int, change_rad_s: Floats) -> None:
+        """Whether an arm's servos can change their speeds by so much (5,) at once without leaving their way."""
+        worst = int(np.argmax(np.abs(change_rad_s)))
+        changed = math.degrees(abs(change_rad_s[worst]))
+        if changed > self._most_change_deg_s + _ROUNDING:
+            what = f"the change of the speed of {ARM_JOINTS[worst]}"
+            raise self._rejected(Reason.SPEED_CHANGE, arm, what, changed, f"up to {self._most_change_deg_s:g} degrees/s at once")
 
     def _check_ways(self, ways: Sequence[Floats | None], commanded: Collection[int], together: bool) -> None:
         """Whether arms may go their ``ways`` (3, 6), None of one that is unknown; those that are ``commanded`` are judged."""

@@ -159,9 +159,11 @@ class BusConfig:
 
     p: int = bounded(32, 1, 254)  # stiffness, as shipped; half of it sags twice as far
     d: int = bounded(32, 0, 254)
-    acceleration: int = bounded(150, 1, 254)  # 100 counts/s^2
+    acceleration: int = bounded(254, 1, 254)  # 100 counts/s^2
+    lead_deg: float = bounded(3.0, 0.0, 10.0)  # a servo brakes for its goal, so a fast one is sent further, by this much at most
     gripper_torque: int = bounded(500, 50, 1000)  # per mille of the stall torque that a hand closes with
-    follow_deg: float = bounded(8.0, 1.0, 45.0)  # a servo this far from where it was sent is held by something, or too weak
+    speed_change_deg_s: float = bounded(100.0, 1.0, 1000.0)  # greatest change of a joint's speed at once: servos do not turn back suddenly
+    follow_deg: float = bounded(10.0, 1.0, 45.0)  # a servo this far from where it was sent is held by something, or too weak
     trim_deg: float = bounded(6.0, 0.0, 20.0)  # how far beyond its place a servo is sent at most, so that it does not sag
     trim_share: float = bounded(0.5, 0.0, 1.0)  # part of what a servo sags that each command takes out
 

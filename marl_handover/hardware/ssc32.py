@@ -265,6 +265,9 @@ class Ssc32(WiredDevice):
     def correct(self) -> None:
         """Nothing: nobody tells what is missing."""
 
+    def keep_within(self, limits: Mapping[int, tuple[float, float]]) -> None:
+        """Nothing: channels go where they are told, and no further."""
+
     def marks(self, channels: Iterable[int]) -> tuple[int, ...]:
         """None: hobby servos keep nothing."""
         return ()

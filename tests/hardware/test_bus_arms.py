@@ -19,6 +19,7 @@ from marl_handover.compose import from_yaml
 from marl_handover.config import MotionConfig
 from marl_handover.errors import CorruptFile, InvalidSetting, MissingFile, UnsupportedKinematics
 from marl_handover.files import resource_path
+from marl_handover.geometry.capsules import ground_clearance_mm
 from marl_handover.hardware import feetech
 from marl_handover.hardware.calibration import (
     CalibrationProblem,
@@ -38,6 +39,7 @@ from marl_handover.hardware.errors import (
     NotConfirmed,
     PortNotFound,
     PulseMismatch,
+    ServoAstray,
     ServoFault,
     ServoMissing,
     Stopped,
@@ -46,7 +48,7 @@ from marl_handover.hardware.errors import (
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.gripper import GripperMap, shifted
 from marl_handover.hardware.lerobot_file import MOTORS, read_motors, write_motors
-from marl_handover.hardware.safety_filter import CommandRejected, JointCommand
+from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason
 from marl_handover.hardware.settings import ARMS, COUNTS, HardwareConfig
 from marl_handover.motion.home import parked_poses
 from marl_handover.simulation.effort import holding_n_m
@@ -264,6 +266,61 @@ def test_a_stop_holds_every_servo_where_it_is(armed):
 @pytest.mark.slow
 def test_five_hundred_stops_hold_every_servo(armed):
     check_stops(armed, 500)
+
+
+RUBBISH = [math.nan, math.inf, 1e300, -40.0]
+
+
+def check_limits(make, count):
+    """Commands towards places within and beyond every limit, fast, slow, late and nonsense: what the arms truly do keeps the limits."""
+    config, random = hardware(), np.random.default_rng(11)
+    config.emulator.bus_zero_deg = 0.0  # so that the nominal calibration is right
+    rig = make(config)
+    driver, model, gate = rig.driver, rig.driver.model, rig.config.gate
+    arm, speeds = model.arm, rig.driver.safety_filter.speed_rad_s
+    rows, met, sent, aims, speed = [], set(), 0, np.zeros((2, 5)), np.zeros((2, 5))
+    for number in range(count):
+        if number % 25 == 0:
+            aims = random.uniform(arm.lower_rad - 0.5, arm.upper_rad + 0.5, (2, 5))
+        duration_s = float(random.choice([0.02, 0.04, 0.1, 0.2]))
+        held = driver.joints_rad()
+        most = np.minimum(speeds * duration_s, math.radians(gate.step_deg)) * random.choice([0.2, 0.5, 0.9, 1.3])
+        who = [[0], [1], [0, 1]][int(random.integers(3))]
+        change = math.radians(rig.config.bus.speed_change_deg_s) * random.choice([0.3, 0.9, 0.9, 1.5])
+        pace = speed + np.clip(np.clip(aims - held, -most, most) / duration_s - speed, -change, change)
+        given = [JointCommand(one, held[one] + pace[one] * duration_s, 12.0) for one in who]
+        if random.random() < 0.03:
+            given = [JointCommand(0, held[0] + random.choice(RUBBISH), 12.0)]
+        try:
+            driver.move(given, duration_s, rig.clock.now_s() - float(random.choice([0.0, 0.0, 0.0, 0.4])))
+            sent += 1
+            speed = np.where(np.isin([[0], [1]], who), pace, 0.0)
+        except CommandRejected as rejection:
+            met.add(rejection.reason)
+            speed = np.zeros((2, 5))
+        except ServoAstray:  # no servo turns back as suddenly as these commands do: all hold, and go on from where they are
+            driver.wait(0.5)
+            driver.resume()
+        driver.wait(duration_s - 0.001)
+        rows.append(rig.cell.joints_rad(rig.clock.now_s()))
+    true = np.array(rows)
+    slack_rad = math.radians(2.0)
+    assert (true >= arm.lower_rad - slack_rad).all()
+    assert (true <= arm.upper_rad + slack_rad).all()
+    assert ground_clearance_mm(arm, true).min() > -2.0
+    assert sent > count / 5
+    assert met >= {Reason.JOINT_LIMIT, Reason.SPEED_CHANGE, Reason.STALE, Reason.NOT_FINITE}
+    rig.clock.sleep_s(0.3)
+    assert driver.state is State.ARMED
+
+
+def test_no_command_makes_arms_leave_their_limits(armed):
+    check_limits(armed, 400)
+
+
+@pytest.mark.slow
+def test_none_of_ten_thousand_commands_makes_arms_leave_their_limits(armed):
+    check_limits(armed, 10_000)
 
 
 FAULTS = {

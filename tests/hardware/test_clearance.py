@@ -9,9 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from marl_handover.cell import build_cell, cell_config
 from marl_handover.geometry.capsules import Capsule, block_capsules, capsule_pairs, segment_distance, self_clearance_mm
 from marl_handover.geometry.se3 import transform
 from marl_handover.hardware.clearance import FAR_MM, SETTLED_MM, alone_mm, arm_shapes, between_mm, still
+
+
+@pytest.fixture(scope="module", params=["paper", "so101"])
+def model(request):
+    """A hand that is level where it picks, and one that points 60 degrees down: its roll axis is not the grip's x."""
+    return build_cell(cell_config(request.param))
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +34,10 @@ def bases(model):
 def held(model):
     """The block's and the pin's capsules, in the frame of the grip."""
     config = model.cell.config
-    return [Capsule("grip", c.start_mm, c.end_mm, c.radius_mm) for c in block_capsules(config.block, model.cell.pick_height_mm)]
+    return [
+        Capsule(model.arm.description.grasp_link, c.start_mm, c.end_mm, c.radius_mm)
+        for c in block_capsules(config.block, model.cell.pick_height_mm)
+    ]
 
 
 def placed(model, q, base, holding=False):
