@@ -260,7 +260,7 @@ class FeetechDriver(FeetechBus):
 
         Written even in a dry run, and twice: an answer under way may have hit the first.
         """
-        listed, now_s = list(channels), self._clock.now_s()
+        wire, listed, now_s = self.wire, list(channels), self._clock.now_s()
         places = {servo: self._set_point(servo, now_s) for servo in listed if servo in self._courses}
         for servo, place in places.items():
             if servo not in self._grippers and abs(self._seen.get(servo, place) - place) > self._most_off:
@@ -269,13 +269,13 @@ class FeetechDriver(FeetechBus):
         if not held:
             return LineRecord(self.name, now_s, b"", True)
         data = sync_write(("goal_position",), {servo: (goal,) for servo, goal in held.items()})
-        written_s = self.wire.write(data)
+        written_s = wire.write(data)
         for servo, goal in held.items():
             place = places[servo]
             self._courses[servo].append(_Course(place, place, now_s, now_s))
             self._goals[servo] = goal
         self._clock.sleep_s(self._longest_answer_s())
-        self.wire.write(data)
+        wire.write(data)
         return LineRecord(self.name, written_s, data, True)
 
     def torque_off(self, channels: Iterable[int]) -> LineRecord:

@@ -254,6 +254,15 @@ def check_stops(make, count, seed=0):
         rig.driver.park()
 
 
+def test_a_stop_that_reaches_only_one_arm_says_so(armed):
+    rig = armed()
+    rig.left.add_faults(parse_servo_faults(f"unplug@{rig.clock.now_s() + 0.01}"))
+    rig.clock.sleep_s(0.05)
+    assert rig.driver.halt() is False
+    rig.driver.boards.by_name["left"].close()
+    assert rig.driver.halt() is False
+
+
 def limits(rig):
     arm = rig.driver.model.arm
     return arm.lower_rad, arm.upper_rad
@@ -304,7 +313,7 @@ def check_limits(make, count):
         driver.wait(duration_s - 0.001)
         rows.append(rig.cell.joints_rad(rig.clock.now_s()))
     true = np.array(rows)
-    slack_rad = math.radians(2.0)
+    slack_rad = math.radians(2.5)  # play of the gears, and what a fast servo is sent ahead by
     assert (true >= arm.lower_rad - slack_rad).all()
     assert (true <= arm.upper_rad + slack_rad).all()
     assert ground_clearance_mm(arm, true).min() > -2.0
