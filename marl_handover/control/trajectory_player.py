@@ -267,7 +267,7 @@ class TrajectoryPlayer:
                 held_once = True
                 self.log.add(Event.PULSE_MISMATCH, text=failure)
                 self.driver.wait(_RETRY_S)
-                self.driver.resume()
+                self.driver.recover()
             except _FINAL:
                 raise
             except ArmingLost as failure:

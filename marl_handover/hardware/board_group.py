@@ -73,16 +73,6 @@ class Wiring:
             found.setdefault(self._config.arms[name].board, {}).update(zip(self._config.channels(name), whole, strict=True))
         return found
 
-    def limits(self) -> dict[str, dict[int, tuple[float, float]]]:
-        """Board -> channel -> least and greatest pulse of every joint, by its limits."""
-        found: dict[str, dict[int, tuple[float, float]]] = {}
-        for name, calibration in zip(self._names, self._calibrations, strict=True):
-            wiring = self._config.arms[name]
-            for channel, servo, ends in zip(wiring.channels, calibration.maps, calibration.limits_rad, strict=True):
-                low, high = sorted(float(servo.to_us(end)) for end in ends)
-                found.setdefault(wiring.board, {})[channel] = low, high
-        return found
-
     def speeds(self, board: str, channels: Iterable[int]) -> dict[int, int]:
         """Greatest speeds in us/s."""
         return {channel: self._speeds[board, channel] for channel in channels}
@@ -202,9 +192,6 @@ class Controller(Protocol):
     def marks(self, channels: Iterable[int]) -> tuple[int, ...]:
         """What servos keep that tells one arm from another; nothing where they keep nothing."""
 
-    def keep_within(self, limits: Mapping[int, tuple[float, float]]) -> None:
-        """What is added to a pulse, for a servo's own reasons, must not take it beyond these."""
-
     def limp(self, channels: Iterable[int]) -> list[int]:
         """Servos that do not hold, although it is known where they stand."""
 
@@ -214,8 +201,10 @@ class Controller(Protocol):
     def first_move(self, pulses: Mapping[int, int], time_ms: int | None) -> LineRecord:
         """Hold servos where they are known to stand."""
 
-    def move(self, pulses: Mapping[int, int], time_ms: int, speeds: Mapping[int, int] | None = None) -> LineRecord:
-        """Move servos together, in a time, none faster than its speed."""
+    def move(
+        self, pulses: Mapping[int, int], time_ms: int, speeds: Mapping[int, int] | None = None, aims: Mapping[int, int] | None = None
+    ) -> LineRecord:
+        """Move servos together, in a time, none faster than its speed; towards ``aims``, further on, those that brake for their goal."""
 
     def correct(self) -> None:
         """Bring servos that stand still nearer to where they were sent, where encoders tell what is missing."""
@@ -284,11 +273,6 @@ class BoardGroup:
         """Ask whether every wired channel puts out what it was sent by now. Raises as :meth:`Ssc32.require_pulses`."""
         for name, board in self.by_name.items():
             board.require_pulses(self._channels[name], self._tolerance_us)
-
-    def keep_within(self, limits: Mapping[str, Mapping[int, tuple[float, float]]]) -> None:
-        """As :meth:`Controller.keep_within`, board by board."""
-        for name, found in limits.items():
-            self.by_name[name].keep_within(found)
 
     def marks(self, config: HardwareConfig) -> list[tuple[int, ...]]:
         """What every arm's servos keep that tells it from others; see :class:`Controller`."""

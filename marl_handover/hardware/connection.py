@@ -116,7 +116,6 @@ class ArmConnection:
         pin_mm = self.model.cell.config.block.pin_diameter_mm
         hand = self.model.arm.description.gripper
         self._wiring = Wiring(self.config, self.calibrations, hand, pin_mm, self._safety_filter.speed_rad_s)
-        self.boards.keep_within(self._wiring.limits())
         self.state = State.CONFIGURED
 
     def reconnect(self) -> None:

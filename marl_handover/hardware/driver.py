@@ -26,11 +26,11 @@ from marl_handover.config import MotionConfig
 from marl_handover.hardware.board_group import Pulses, all_held, none_held, readback_middles
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.connection import FILTER_OFF, ArmConnection, State
-from marl_handover.hardware.errors import BadCommand, HalfHeld, NotConfirmed, WrongState
+from marl_handover.hardware.errors import BadCommand, HalfHeld, NotConfirmed, Stopped, WrongState
 from marl_handover.hardware.estop import StopLatch
 from marl_handover.hardware.expected_pulses import SETTLED_S
-from marl_handover.hardware.safety_filter import JointCommand
-from marl_handover.hardware.settings import HardwareConfig
+from marl_handover.hardware.safety_filter import CommandRejected, JointCommand
+from marl_handover.hardware.settings import COUNTS_PER_RAD, HardwareConfig
 from marl_handover.hardware.transport import LineRecord
 from marl_handover.motion.home import parked_poses
 
@@ -189,6 +189,18 @@ class ArmDriver(ArmConnection):
             self.boards.require_holding()
             self._restate()
 
+    def recover(self) -> None:
+        """After :class:`ServoAstray`: take the arms where they stand, and go on from there; an overload ends with it. Nothing moves.
+
+        Raises as :meth:`resync`.
+        """
+        if self.state is not State.STOPPED:
+            raise WrongState("recover", self.state, State.STOPPED)
+        if self.latch.is_set():
+            raise Stopped(self.latch.reason())
+        self.state = State.CONFIGURED
+        self.resync()
+
     def park(self) -> None:
         """Drive one arm after the other to the parked pose, slowly and straight in joint angles. Raises as :meth:`move`.
 
@@ -235,11 +247,36 @@ class ArmDriver(ArmConnection):
                 self.wait(max(backlog_s - stream.backlog_s, stream.poll_s))
             with self._allowed(needs):
                 self.safety_filter.check(commands, duration_s, self.clock.now_s(), made)
-                pulses = self.wiring.pulses(commands)
+                pulses, aims = self.wiring.pulses(commands), self.wiring.pulses(self._ahead(commands, duration_s))
                 time_ms = max(1, round(1000 * duration_s))
-                lines = [self.boards.by_name[name].move(found, time_ms, self.wiring.speeds(name, found)) for name, found in pulses.items()]
+                lines = [
+                    self.boards.by_name[name].move(found, time_ms, self.wiring.speeds(name, found), aims[name])
+                    for name, found in pulses.items()
+                ]
                 self.safety_filter.accept(commands, duration_s, self.clock.now_s())
         return MoveRecord(tuple(lines), self._stood_for(pulses, commands), duration_s)
+
+    def _ahead(self, commands: Sequence[JointCommand], duration_s: float) -> Sequence[JointCommand]:
+        """Where servos have to be sent that brake for their goals, so as to be in time at ``commands``; these, if the way on is not clear.
+
+        They go on by so much if nothing follows, because the host died; hence the bound, ``bus.lead_deg``, and the look.
+        """
+        if not self.boards.have_encoders:
+            return commands
+        bus, now_s, arm = self.config.bus, self.clock.now_s(), self.model.arm
+        most_rad, brakes_rad_s2 = math.radians(bus.lead_deg), 100.0 * bus.acceleration / COUNTS_PER_RAD
+        ahead = []
+        for command in commands:
+            held, target = self.safety_filter.held(command.arm, now_s), np.asarray(command.joints_rad, float)
+            speed = np.zeros(5) if held is None else (target - held[0]) / duration_s
+            further = np.copysign(np.minimum(speed**2 / (2 * brakes_rad_s2), most_rad), speed)
+            ahead.append(command._replace(joints_rad=np.clip(target + further, arm.lower_rad, arm.upper_rad)))
+        try:
+            if self.config.gate.enabled:
+                self.safety_filter.check_room({command.arm: self.safety_filter.target(command) for command in ahead}, now_s)
+        except CommandRejected:
+            return commands
+        return ahead
 
     def _stood_for(self, pulses: Mapping[str, Mapping[int, int]], commands: Sequence[JointCommand]) -> dict[int, Floats]:
         return {command.arm: self.wiring.state(pulses, command.arm)[0] for command in commands}

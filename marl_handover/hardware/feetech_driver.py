@@ -104,7 +104,6 @@ class FeetechDriver(FeetechBus):
         self._trims: dict[int, float] = {}
         self._untried: set[int] = set()
         self._seen: dict[int, int] = {}
-        self._limits: dict[int, tuple[float, float]] = {}
 
     def connect(self) -> None:
         """Find the servos, see that they are what they should be, and set what lasts where it differs.
@@ -189,10 +188,6 @@ class FeetechDriver(FeetechBus):
                 self._compare(servo, state[servo][2], now_s)
         return {servo: (state[servo][2], state[servo][4]) for servo in listed}
 
-    def keep_within(self, limits: Mapping[int, tuple[float, float]]) -> None:
-        """From now on no servo is sent beyond these counts, but for what it sags, unless it is told to."""
-        self._limits = dict(limits)
-
     def note_readback(self, pulses: Mapping[int, int]) -> None:
         """Take readings of servos that stand still for where they were sent."""
         for servo, pulse in pulses.items():
@@ -225,8 +220,13 @@ class FeetechDriver(FeetechBus):
             self._require_well(list(goals))
         return sent
 
-    def move(self, pulses: Mapping[int, int], time_ms: int, speeds: Mapping[int, int] | None = None) -> LineRecord:
-        """Move servos together, each at most at its speed in counts/s; a :class:`NoReference` if any of them is not held."""
+    def move(
+        self, pulses: Mapping[int, int], time_ms: int, speeds: Mapping[int, int] | None = None, aims: Mapping[int, int] | None = None
+    ) -> LineRecord:
+        """Move servos together, each at most at its speed in counts/s; a :class:`NoReference` if any of them is not held.
+
+        ``aims``: goals further on than ``pulses``, so that servos do not brake; they stay there if nothing follows.
+        """
         unknown = [servo for servo in pulses if servo not in self._courses]
         if unknown:
             raise NoReference(self.name, unknown)
@@ -238,8 +238,7 @@ class FeetechDriver(FeetechBus):
             self._courses[servo].append(course)
             most = (speeds or {}).get(servo, COUNTS)
             speed = min(max(math.ceil(_SPARE * max(course.speed, before)), _MIN_SPEED), max(most, 1))
-            low, high = self._limits.get(servo, (-math.inf, math.inf))
-            self._goals[servo] = self._goal(servo, min(max(pulse + self._lead(course), min(low, pulse)), max(high, pulse)))
+            self._goals[servo] = self._goal(servo, pulse if aims is None else aims[servo])
             self._untried.add(servo)
             goals[servo] = (self._goals[servo], 0, speed)
         return self._send(_MOVE, goals)
@@ -323,14 +322,6 @@ class FeetechDriver(FeetechBus):
 
     def _set_point(self, servo: int, t_s: float) -> float:
         return self._courses[servo][-1].at(t_s)
-
-    def _lead(self, course: _Course) -> float:
-        """How much further a servo is sent than where it is to be when a course ends, for it brakes early enough to stop at its goal.
-
-        If nothing follows, because the host died, it goes on by so much: hence the bound.
-        """
-        further = min(course.speed**2 / (200.0 * self._settings.acceleration), self._settings.lead_deg * COUNTS / 360)
-        return math.copysign(further, course.target - course.start)
 
     def _goal(self, servo: int, pulse: float) -> int:
         unit = PROTOCOLS["feetech"]

@@ -265,9 +265,6 @@ class Ssc32(WiredDevice):
     def correct(self) -> None:
         """Nothing: nobody tells what is missing."""
 
-    def keep_within(self, limits: Mapping[int, tuple[float, float]]) -> None:
-        """Nothing: channels go where they are told, and no further."""
-
     def marks(self, channels: Iterable[int]) -> tuple[int, ...]:
         """None: hobby servos keep nothing."""
         return ()
@@ -325,8 +322,17 @@ class Ssc32(WiredDevice):
         self._known.update(pulses_us)
         return sent
 
-    def move(self, pulses_us: Mapping[int, int], time_ms: int, speeds_us_s: Mapping[int, int] | None = None) -> LineRecord:
-        """Move channels together, each at most at its speed; a :class:`NoReference` if any of them was never moved."""
+    def move(
+        self,
+        pulses_us: Mapping[int, int],
+        time_ms: int,
+        speeds_us_s: Mapping[int, int] | None = None,
+        aims_us: Mapping[int, int] | None = None,
+    ) -> LineRecord:
+        """Move channels together, each at most at its speed; a :class:`NoReference` if any of them was never moved.
+
+        ``aims_us`` are for servos that brake for their goal, and not used.
+        """
         unknown = [channel for channel in pulses_us if channel not in self._known]
         if unknown:
             raise NoReference(self.name, unknown)

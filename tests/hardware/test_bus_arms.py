@@ -309,14 +309,14 @@ def check_limits(make, count):
             speed = np.zeros((2, 5))
         except ServoAstray:  # no servo turns back as suddenly as these commands do: all hold, and go on from where they are
             driver.wait(0.5)
-            driver.resume()
+            driver.recover()
         driver.wait(duration_s - 0.001)
         rows.append(rig.cell.joints_rad(rig.clock.now_s()))
     true = np.array(rows)
     slack_rad = math.radians(2.5)  # play of the gears, and what a fast servo is sent ahead by
     assert (true >= arm.lower_rad - slack_rad).all()
     assert (true <= arm.upper_rad + slack_rad).all()
-    assert ground_clearance_mm(arm, true).min() > -2.0
+    assert ground_clearance_mm(arm, true).min() > -5.0, "0.65 degrees of play, 440 mm out"
     assert sent > count / 5
     assert met >= {Reason.JOINT_LIMIT, Reason.SPEED_CHANGE, Reason.STALE, Reason.NOT_FINITE}
     rig.clock.sleep_s(0.3)
