@@ -34,6 +34,7 @@ __all__ = [
     "LAYOUTS",
     "MAX_SEED",
     "PHYSICS",
+    "REWARDS",
     "ArmConfig",
     "BlockConfig",
     "CellConfig",
@@ -70,6 +71,8 @@ LAYOUTS: Registry[Any] = Registry(
     | {"graph": "marl_handover.task.graph_observation:GRAPH"},
 )
 """Observation layouts, each a :class:`~marl_handover.task.observations.Layout`."""
+REWARDS: Registry[Any] = Registry("reward")
+"""Rewards of one's own: functions of (rules, verdict, placed (..., 3), goal (..., 3)) that return (...) rewards, numpy and torch alike."""
 BACKENDS: Registry[Any] = Registry(
     "backend",
     {
@@ -253,6 +256,7 @@ class RewardConfig:
     step: float = bounded(-1.0, -1e6, 1e6)
     failure: float = bounded(-30.0, -1e6, 1e6)
     motion_weight: float = bounded(0.0, 0.0, 1e6)  # reward -= motion_weight * path cost [mm] / 100
+    function: str = ""  # of a plugin: what it makes of the three above, in architecture B
 
 
 @dataclass
@@ -291,6 +295,10 @@ class TaskConfig:
     def validate(self) -> None:
         """Raise :class:`InvalidSetting` or :class:`UnknownChoice` on a value out of its limits."""
         check_bounds(self)
+        if self.reward.function:
+            require_choice("task.reward.function", self.reward.function, REWARDS)
+            if self.architecture != "B":
+                raise InvalidSetting("task.reward.function", self.reward.function, "left out in architecture A, which ends by kinematics")
 
 
 @dataclass

@@ -62,14 +62,14 @@ def _of_this_package(made):
 def no_new_plugins(monkeypatch):
     """What a plug-in registers meanwhile is forgotten afterwards."""
     from marl_handover import plugins
-    from marl_handover.config import BACKENDS, ENGINES, LAYOUTS
+    from marl_handover.config import BACKENDS, ENGINES, LAYOUTS, REWARDS
     from marl_handover.learning.algorithm import LEARNERS
     from marl_handover.learning.settings import ALGORITHMS
     from marl_handover.policies import POLICIES
 
     monkeypatch.delenv(plugins.VARIABLE, raising=False)
     monkeypatch.setattr(plugins, "_loaded", set())
-    tables = [LEARNERS, *(registry._entries for registry in (ALGORITHMS, BACKENDS, ENGINES, LAYOUTS, POLICIES))]
+    tables = [LEARNERS, *(registry._entries for registry in (ALGORITHMS, BACKENDS, ENGINES, LAYOUTS, POLICIES, REWARDS))]
     before = [dict(table) for table in tables]
     yield
     for table, entries in zip(tables, before, strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +42,12 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: EvaluateCommand) -> int:
     """Play, print the table, write the files."""
+    evaluated(config, print)
+    return 0
+
+
+def evaluated(config: EvaluateCommand, say: Callable[[str], None]) -> dict[str, Any]:
+    """Play, say the table, write the files, and return what ``json=FILE`` gets."""
     for name, path in (("json", config.json), ("trace", config.trace)):
         if path and not Path(path).parent.is_dir():
             raise MissingFile("folder", Path(path).parent, "make it first")
@@ -48,16 +55,16 @@ def run(config: EvaluateCommand) -> int:
             raise InvalidSetting(name, path, "a file, not a folder")
     with _recording(config) as recorder:
         done = assess(config, traced=bool(config.trace), progress=config.progress, recorder=recorder)
-    print(table(done.report, done.result))
+    say(table(done.report, done.result))
     if recorder is not None:
-        print(f"\n{recorder.told()}")
+        say(f"\n{recorder.told()}")
     if config.json:
         if config.ladder:  # what an entry of the ladder has to say besides
             done.report.update(commit=commit(), machine=machine())
         write_whole(Path(config.json), json.dumps(done.report, indent=2) + "\n")
     if config.trace:
         write_whole(Path(config.trace), done.trace_text())
-    return 0
+    return done.report
 
 
 def _recording(config: EvaluateCommand) -> AbstractContextManager[Recorder | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,6 +70,12 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: PlanConfig) -> int:
     """Solve, print, write. Raises :class:`WorkFailed` if the policy does not reach the goal."""
+    planned(config, print)
+    return 0
+
+
+def planned(config: PlanConfig, say: Callable[[str], None]) -> dict[str, Any]:
+    """Solve, say how, write, and return what ``json=FILE`` gets. Raises :class:`WorkFailed` if the policy does not reach the goal."""
     from marl_handover.report.figure_style import require_picture, save_figure, write_json
 
     for name in ("picture", "motion_picture"):
@@ -85,9 +92,9 @@ def run(config: PlanConfig) -> int:
         rules.cell.require_reached(name, pose)
     planner = _planner(config, policy)
     plan = solve(policy, poses["start"], poses["goal"])
-    print(_text(plan, rules))
+    say(_text(plan, rules))
     if planner is not None:
-        _move(config, plan, planner)  # first: if there is no motion, nothing is written
+        _move(config, plan, planner, say)  # first: if there is no motion, nothing is written
     if config.json:
         write_json(Path(config.json), plan)
     if config.picture:
@@ -98,10 +105,10 @@ def run(config: PlanConfig) -> int:
         waiting = "; no arm moves any more" if plan["waiting"] else ""
         made = counted(len(plan["transfers"]), "transfer")
         raise WorkFailed(f"policy {policy.name!r} did not reach the goal: {plan['outcome']} after {made}{waiting}")
-    return 0
+    return plan
 
 
-def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> None:
+def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner, say: Callable[[str], None]) -> None:
     """Plan the motion of every transfer that was not refused, say what it is, and write it as file and picture.
 
     Raises:
@@ -118,13 +125,13 @@ def _move(config: PlanConfig, plan: dict[str, Any], planner: MotionPlanner) -> N
     motions = plan_motions(planner, orders)
     nearest = "the other arm" if len(labels) == 2 else "other arms"
     for number, motion in enumerate(motions, start=1):
-        print(
+        say(
             f"motion {number}: arm {labels[motion.arm]}, {motion.duration_s:.2f} s, grip path {motion.path_length_mm:.1f} mm, "
             f"clearance to {nearest} {motion.min_clearance_mm:.1f} mm, planned in {motion.planning_ms:.1f} ms"
         )
     schedule = coordinate(planner, motions)
     if len(motions) > 1:
-        print(
+        say(
             f"one after another {schedule.sequential_s:.2f} s; with the next arm setting out as early as the clearance allows "
             f"{schedule.overlapped_s:.2f} s, {100 * schedule.saved:.0f} % less"
         )

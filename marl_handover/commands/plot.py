@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,12 @@ GROUPS: dict[str, dict[str, type]] = {}
 
 def run(config: PlotConfig) -> int:
     """Draw one figure, or those of a suite, and say where it is."""
+    drawn(config, print)
+    return 0
+
+
+def drawn(config: PlotConfig, say: Callable[[str], None]) -> Path:
+    """Draw one figure, or those of a suite, say where it is, and return that: a file, or a suite's folder."""
     from marl_handover.report.figure_style import require_picture, save_figure
 
     check_bounds(config)
@@ -50,7 +57,7 @@ def run(config: PlotConfig) -> int:
     if config.out and not whole_suite:
         require_picture("out", config.out)
     if whole_suite:
-        return _whole_suite(config)
+        return _whole_suite(config, say)
     makers = {
         "run": _run,
         "workspace": _workspace,
@@ -64,8 +71,8 @@ def run(config: PlotConfig) -> int:
     figure, default = makers[config.kind](config)
     out = Path(config.out) if config.out else default
     save_figure(figure, out)
-    print(f"written: {out}")
-    return 0
+    say(f"written: {out}")
+    return out
 
 
 def run_folders(text: str) -> list[Path]:
@@ -206,7 +213,7 @@ def _suite_figure(config: PlotConfig) -> tuple[Figure, Path]:
     return figures[config.figure], folder / "figures" / f"{config.figure}.png"
 
 
-def _whole_suite(config: PlotConfig) -> int:
+def _whole_suite(config: PlotConfig, say: Callable[[str], None]) -> Path:
     """All figures of a suite, each as PNG and PDF."""
     from marl_handover.report.figure_style import save_figure
 
@@ -214,12 +221,12 @@ def _whole_suite(config: PlotConfig) -> int:
     out = Path(config.out) if config.out else folder / "figures"
     for name, figure in figures.items():
         if figure is None:
-            print(f"no values yet: {name}")
+            say(f"no values yet: {name}")
             continue
         for suffix in ("png", "pdf"):
             save_figure(figure, out / f"{name}.{suffix}")
-        print(f"written: {out / name}.png, .pdf")
-    return 0
+        say(f"written: {out / name}.png, .pdf")
+    return out
 
 
 def _suite(config: PlotConfig) -> tuple[Path, dict[str, Figure | None]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -26,7 +27,13 @@ FREE_ON_RESUME = ("resume", "out", "progress")
 
 
 def run(config: TrainConfig) -> int:
-    """Start a run, or continue one from its last checkpoint with the settings it was started with.
+    """Start a run, or continue one from its last checkpoint with the settings it was started with."""
+    trained(config, lambda text: print(text, file=sys.stderr))
+    return 0
+
+
+def trained(config: TrainConfig, say: Callable[[str], None]) -> Path:
+    """Start a run, or continue one, say what came of it, and return its directory.
 
     Raises:
         FolderBusy: another process trains in that folder.
@@ -44,12 +51,11 @@ def run(config: TrainConfig) -> int:
             _require_no_run(trainer.folder)  # somebody else may have made one meanwhile
             summary = trainer.run()
     validation = summary["validation"]
-    print(
+    say(
         f"{trainer.folder}: {summary['step']} environment steps, {summary['gradient_step']} gradient steps, "
-        f"{summary['wall_s']:.0f} s; success {100 * validation['success_rate']:.2f} % on its validation problems",
-        file=sys.stderr,
+        f"{summary['wall_s']:.0f} s; success {100 * validation['success_rate']:.2f} % on its validation problems"
     )
-    return 0
+    return trainer.folder
 
 
 def _begun(config: TrainConfig) -> Trainer:

@@ -30,6 +30,9 @@ Observation = dict[str, NDArray[np.float32]]
 
 LAYOUT, RENDER_MODES = "object", ("rgb_array", "human")
 
+NEVER_RAD = -1.0
+"""An accuracy that nothing has."""
+
 PROBES = 32
 """Objects that a layout is tried out on."""
 
@@ -243,13 +246,8 @@ class SupervisorGoalEnv(gymnasium.Env[Any, Any]):
             command = Command(np.ones_like(final), np.maximum(arm, 0), desired[..., :2])
             placed, able = self.rules.transfer(start, desired, command)
             achieved, feasible = one_where(told, placed, achieved), np.where(told, able, feasible)
-        verdict = self.rules.judge(achieved, desired, final, feasible)
         goes_on = (arm != NO_ARM) & ~final & feasible
-        return Verdict(
-            np.where(goes_on, self.rules.config.reward.step, verdict.reward),
-            np.where(goes_on, False, verdict.terminated),
-            np.where(goes_on, int(Outcome.NONE), verdict.outcome),
-        )
+        return self.rules.judge(achieved, desired, final, feasible, np.where(goes_on, NEVER_RAD, self.rules.epsilon_rad))
 
     @staticmethod
     def _read(info: Any, key: str, absent: Any, shape: tuple[int, ...]) -> NDArray[Any]:

@@ -18,7 +18,7 @@ from marl_handover.cell.arm import REACH_TOLERANCE_MM
 from marl_handover.cell.batch import CellBatch
 from marl_handover.cell.cell import Cell
 from marl_handover.cell.symmetry import NO_ARM
-from marl_handover.config import TaskConfig
+from marl_handover.config import REWARDS, TaskConfig
 
 MotionCost = Callable[[Cell, Array, Array, Array], Array]
 """Cost in mm, shape (...), of a transfer: cell, arm (...), from_mm (..., 2), to_mm (..., 2). Eq. (3) of the paper."""
@@ -213,7 +213,12 @@ class Rules:
         earned = xp.where(success, reward.success * one, xp.where(failure, reward.failure * one, reward.step * one))
         missed = xp.where(feasible & there, int(Outcome.WRONG_ORIENTATION), int(Outcome.WRONG_POSITION))
         outcome = xp.where(success, int(Outcome.SUCCESS), xp.where(failure, missed, int(Outcome.NONE)))
-        return Verdict(earned, success | failure, outcome)
+        return self._own_reward(Verdict(earned, success | failure, outcome), placed, goal)
+
+    def _own_reward(self, verdict: Verdict, placed: Array, goal: Array) -> Verdict:
+        """The verdict with the reward that the function of a plugin makes of it, if the settings name one."""
+        name = self.config.reward.function
+        return verdict._replace(reward=REWARDS[name](self, verdict, placed, goal)) if name else verdict
 
     def motion_penalty(self, arm: Array, pose: Array, placed: Array) -> Array:
         """What a commanded transfer costs for its path, (...): motion_weight * path cost in mm / 100; it does not depend on the goal."""
