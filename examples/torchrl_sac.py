@@ -46,13 +46,13 @@ def train(steps: int = 150_000, cells: int = 64, hidden: int = 256, seed: int = 
     module = TensorDictModule(net, ["observation"], ["loc", "scale"])
     actor = ProbabilisticActor(module, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True, spec=env.action_spec)
     value = ValueOperator(MLP(size + actions, 1, num_cells=[hidden] * 2, activation_class=nn.ReLU), in_keys=["observation", "action"])
-    loss = SACLoss(actor, value, target_entropy=-float(actions))
+    loss = SACLoss(actor, value, target_entropy=-float(actions), alpha_init=0.1)
     loss.make_value_estimator(gamma=0.95)
     target, optimizer = SoftUpdate(loss, tau=0.005), torch.optim.Adam(loss.parameters(), lr=5e-4)
     memory = TensorDictReplayBuffer(storage=LazyTensorStorage(2 * steps), batch_size=256)
     state, curve = env.reset(), []
     for step in range(cells, steps + 1, cells):
-        with torch.no_grad():
+        with torch.no_grad(), set_interaction_type(InteractionType.RANDOM):
             action = env.rand_action(state) if step < 2000 else actor(state)
             taken, state = env.step_and_maybe_reset(action)
         memory.extend(taken.select(*loss.in_keys, "achieved_goal"))
