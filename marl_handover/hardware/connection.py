@@ -260,6 +260,8 @@ class ArmConnection:
             self.state = State.LOST
             raise
         except ArmingLost:
+            if self.boards.have_encoders:
+                self.boards.stop()  # those that hold are in the middle of a motion that nobody goes on with
             self.safety_filter.forget()
             self.state = State.CONFIGURED
             raise

@@ -43,6 +43,7 @@ class MoveRecord(NamedTuple):
     duration_s: float
 
 
+_STILL_WITHIN_S, _STILL_COUNTS = 1.0, 3
 _RESTATED_S = 0.2
 """Time for moves of half a reading, to where arms are held already."""
 
@@ -348,7 +349,7 @@ class ArmDriver(ArmConnection):
 
     def _restate(self) -> None:
         """Send every channel where it is held, and take it for where the arms are. A joint at its limit is not sent past it."""
-        pulses = self.boards.pulses()
+        pulses = self._still_pulses()
         stay = self._refer(pulses)
         wanted, within = readback_middles(pulses, self.config.unit), self.wiring.pulses(stay)
         for wiring in self.config.arms.values():
@@ -356,6 +357,18 @@ class ArmDriver(ArmConnection):
         with self._allowed(State.ARMING):
             self.boards.first_move(wanted, round(1000 * _RESTATED_S))
         self.settle(_RESTATED_S + SETTLED_S)
+
+    def _still_pulses(self) -> Pulses:
+        """Where servos are; those that tell where they stand are waited for until they do, for what moves cannot be held where it is."""
+        pulses = self.boards.pulses()
+        end_s = self.clock.now_s() + _STILL_WITHIN_S
+        while self.boards.have_encoders and self.clock.now_s() < end_s:
+            self.wait(self.config.stream.period_s)
+            before, pulses = pulses, self.boards.pulses()
+            moved = (abs((pulses[name][channel] or 0) - (at or 0)) for name, found in before.items() for channel, at in found.items())
+            if max(moved) <= _STILL_COUNTS:
+                break
+        return pulses
 
     def _leave(self, broken: bool) -> None:
         try:

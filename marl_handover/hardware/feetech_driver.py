@@ -192,7 +192,8 @@ class FeetechDriver(FeetechBus):
         """Take readings of servos that stand still for where they were sent."""
         for servo, pulse in pulses.items():
             self._courses[servo] = deque([_Course(pulse, pulse, 0.0, 0.0)], maxlen=16)
-            self._trims[servo] = self._bounded(self._goals.get(servo, pulse) - pulse)
+            # A hand is kept from where it is sent by what it holds: that is nothing to be taken out.
+            self._trims[servo] = 0.0 if servo in self._grippers else self._bounded(self._goals.get(servo, pulse) - pulse)
 
     def referenced(self, channels: Iterable[int]) -> bool:
         """Whether all these servos are held where they are known to be."""
