@@ -167,7 +167,11 @@ class FeetechDriver(FeetechBus):
         try:
             present = self._well(listed)
         except (BoardReset, ServoFault, PulseMismatch):
-            present = self._well(listed)  # a damaged answer may look like a whole one: bad news is believed when it comes twice
+            try:  # a damaged answer may look like a whole one: bad news is believed when it comes twice
+                present = self._well(listed)
+            except BoardReset as reset:
+                self._forget(reset.channels)  # nothing is to be sent to these: a goal would switch them on, at full speed
+                raise
         for servo in listed:
             if servo in self._untried and servo not in self._grippers:
                 self._learn(servo, *present[servo])

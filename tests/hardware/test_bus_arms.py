@@ -371,6 +371,9 @@ def test_after_a_brown_out_arms_are_not_taken_to_be_where_they_fell(armed):
     rig.left.add_faults(parse_servo_faults(f"brownout@{rig.clock.now_s() + 0.1}"))
     with pytest.raises(BoardReset):
         swing(rig, 20)
+    rig.driver.halt()
+    rig.clock.sleep_s(0.1)
+    assert not any(servo.holds for servo in rig.left.servos), "a goal would have switched them on, wherever they are"
     with pytest.raises(BoardReset):
         rig.driver.resync()
 
