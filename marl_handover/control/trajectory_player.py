@@ -347,11 +347,17 @@ class TrajectoryPlayer:
 
     def _resynced(self) -> bool:
         """Whether the arms could be taken where they are held, for the motion to go on from there. An overload that passes ends with it."""
-        try:
-            self.driver.resync()
-        except (ArmingLost, BadReply, ConnectionLost, CommandRejected):
-            return False
-        return True
+        end_s = self.workcell.clock.now_s() + self.driver.config.timeouts.reconnect_s
+        while True:
+            try:
+                self.driver.resync()
+                return True
+            except (ArmingLost, CommandRejected):
+                return False
+            except (BadReply, ConnectionLost):
+                if self.workcell.clock.now_s() >= end_s:
+                    return False
+                self.driver.reconnect()
 
     def _start_over(self) -> bool:
         """From the parked pose, into which somebody has put the arms. Always False: the motion was broken off."""
