@@ -395,6 +395,7 @@ class Decentralised(Variant):
             return algorithm.act(own_view(both, turn, torch.zeros_like(turn)))
 
         def act(pose: Tensor, goal: Tensor, previous: Tensor) -> Tensor:
+            """What the arm whose turn it is answers, or, if it passes, the other one."""
             first = rules.turn_of(previous)
             answer = asked(pose, goal, first)
             passed = rules.passes(answer)

@@ -144,7 +144,9 @@ def _servos(config: CalibrateCommand, devices: Devices, operator: Operator, mode
         {name: measured.half_band_sd_us for name, measured in found.items()},
     )
     print(f"-> {config.folder()}")
-    for name, measured in found.items() if driver.config.protocol == "feetech" else ():
+    for name, measured in found.items():
+        if not measured.calibration.homing_offsets:  # servos of a board, which LeRobot does not drive
+            continue
         ids, closed = driver.config.channels(name), driver.config.arms[name].gripper.closed_us
         path = config.folder() / "lerobot" / f"{name}.json"
         make_folder(path.parent)

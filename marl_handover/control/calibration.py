@@ -25,7 +25,7 @@ from marl_handover.control.settings import CardConfig
 from marl_handover.errors import WorkFailed
 from marl_handover.hardware.calibration import CalibrationProblem
 from marl_handover.hardware.clock import Clock
-from marl_handover.hardware.gripper import shifted
+from marl_handover.hardware.gripper import GripperMap
 from marl_handover.hardware.settings import ARMS, GripperConfig
 from marl_handover.motion.planner import MotionPlanner
 from marl_handover.perception.calibration import CameraCalibration, Pixels, calibrate_lens
@@ -219,18 +219,18 @@ class GripperCalibration:
         """
         name = self._names[arm]
         wiring = self.backend.workcell.driver.config.arms[name]
-        asked, unit = self.backend.workcell.config.hardware.arms[name].gripper, self.backend.workcell.driver.config.unit
-        jaw = None if unit.name == "us" else self.backend.workcell.driver.wiring.gripper(name).closing_per_mm
+        hardware = self.backend.workcell.config.hardware
+        asked, pulses = hardware.arms[name].gripper, GripperMap(hardware, name, self.backend.model.arm.description.gripper)
         tries = np.arange(-RANGE_MM, RANGE_MM + STEP_MM / 2, STEP_MM)
         for number, further_mm in enumerate(tries, start=1):
-            wiring.gripper = shifted(asked, float(further_mm), jaw, unit)
+            wiring.gripper = pulses.shifted(float(further_mm))
             held = self._carries(arm)
             self.progress(arm, float(further_mm), held)
             if held and number == 1:
                 raise CalibrationProblem(f"the {name} gripper", self._words(asked, f"it holds the pin {RANGE_MM:g} mm too early"))
             if held:
                 off_mm = float(further_mm) + SURE_MM
-                wiring.gripper = shifted(asked, off_mm, jaw, unit)
+                wiring.gripper = pulses.shifted(off_mm)
                 return Grip(wiring.gripper, off_mm, number)
         raise CalibrationProblem(f"the {name} gripper", self._words(asked, f"it does not hold the pin, {RANGE_MM:g} mm further"))
 

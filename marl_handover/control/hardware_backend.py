@@ -196,6 +196,7 @@ class HardwareBackend:
         next_s = self.config.poll_period_s
 
         def moved(t_s: float) -> bool:
+            """Whether it was seen elsewhere, at a time of the motion."""
             nonlocal next_s
             if t_s < next_s:
                 return False

@@ -146,9 +146,7 @@ def solve_calibration(
         CalibrationProblem: too few sightings, or none of them finite; or what comes out is no servo.
     """
     arm = ARMS.index(before.arm) if arm is None else arm
-    usable = [sighting for sighting in sightings if np.isfinite(sighting.pulses_us).all() and np.isfinite(sighting.seen_mm).all()]
-    if len(usable) < LEAST_SIGHTINGS:
-        raise CalibrationProblem(before.arm, f"{len(usable)} usable sightings; {LEAST_SIGHTINGS} are needed at least")
+    usable = _usable(before.arm, sightings)
     pulses = np.array([sighting.pulses_us for sighting in usable], float)
     zeros, slopes = _lines(before)
     middle = (pulses.mean(axis=0) - zeros) / slopes
@@ -177,6 +175,14 @@ def solve_calibration(
     residual_mm = float(np.sqrt((off_mm**2).sum(axis=1).mean()))
     half_us, sd_us = np.maximum(_USUAL_US + halves @ found.x, 0.0), np.sqrt(np.diag(halves @ covariance @ halves.T))
     return SolvedCalibration(calibration, residual_mm, np.degrees(np.sqrt(np.diag(covariance)[:5])), half_us, sd_us)
+
+
+def _usable(arm: str, sightings: Sequence[MarkerObservation]) -> list[MarkerObservation]:
+    """Those that are finite. Raises :class:`CalibrationProblem` if they are too few."""
+    usable = [sighting for sighting in sightings if np.isfinite(sighting.pulses_us).all() and np.isfinite(sighting.seen_mm).all()]
+    if len(usable) < LEAST_SIGHTINGS:
+        raise CalibrationProblem(arm, f"{len(usable)} usable sightings; {LEAST_SIGHTINGS} are needed at least")
+    return usable
 
 
 def _require_explained(arm: str, off_mm: Floats, success: bool, message: str) -> None:

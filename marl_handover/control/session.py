@@ -110,6 +110,7 @@ class Session:
         asked: list[Floats] = []
 
         def current() -> Floats:
+            """The goal (3,) that is wanted now; a new one is logged."""
             self._hold()
             goal = goals() if self.command_queue.goal is None else self.command_queue.goal
             if not asked or np.abs(goal - asked[-1]).max() > 0:

@@ -455,6 +455,7 @@ def filled(page: str, evidence: Mapping[str, Mapping[str, Any]], pictures: str) 
     """
 
     def replaced(match: re.Match[str]) -> str:
+        """A block with its content as the evidence has it."""
         kind, suite, name = match[2], match[3], match[4]
         content = NOT_RUN + "\n"
         if suite in evidence:

@@ -20,7 +20,7 @@ from marl_handover.hardware.gripper import GripperMap
 from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason
 from marl_handover.hardware.settings import SPEED_US_S, HardwareConfig, ServoUnit
 from marl_handover.hardware.ssc32 import Ssc32
-from marl_handover.hardware.transport import LineRecord, Wire
+from marl_handover.hardware.transport import DeviceOptions, LineRecord, Wire
 
 
 class Wiring:
@@ -139,7 +139,7 @@ def readback_state(
     lower, upper, unit_step = arm_model.lower_rad, arm_model.upper_rad, config.unit.reading
     low, fingers_of = np.array(readings), GripperMap(config, name, arm_model.description.gripper)
     ends = np.sort([calibrations[arm].to_rad(low), calibrations[arm].to_rad(low + unit_step)], axis=0)
-    beyond_rad, beyond_mm = (0.0, 0.0) if config.protocol == "ssc32" else (ENCODER_BEYOND_RAD, ENCODER_BEYOND_MM)
+    beyond_rad, beyond_mm = (ENCODER_BEYOND_RAD, ENCODER_BEYOND_MM) if config.unit.encoders else (0.0, 0.0)
     slack_rad = LIMIT_TOLERANCE_RAD + beyond_rad
     outside = (ends[1] < lower - slack_rad) | (ends[0] > upper + slack_rad)
     if outside.any():
@@ -228,7 +228,7 @@ class BoardGroup:
         self.by_name: dict[str, Controller] = {}
         for name in config.used_boards():
             board = config.boards[name]
-            usual: dict[str, Any] = {"log_entries": config.log_entries, "dry_run": dry_run, "on_wait": on_wait}
+            usual: DeviceOptions = {"log_entries": config.log_entries, "dry_run": dry_run, "on_wait": on_wait}
             if config.protocol == "ssc32":
                 self.by_name[name] = Ssc32(name, board, config.timeouts, clock, **usual)
                 continue

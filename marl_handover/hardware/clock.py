@@ -73,6 +73,7 @@ def follow_real_time(clock: Clock) -> None:
     ahead_s = clock.now_s() - time.monotonic()
 
     def wait() -> None:
+        """Sleep until the computer's clock has caught up, and come again."""
         nonlocal ahead_s
         early_s = clock.now_s() - time.monotonic() - ahead_s
         if early_s > 0:

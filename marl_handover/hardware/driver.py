@@ -248,7 +248,8 @@ class ArmDriver(ArmConnection):
                 self.wait(max(backlog_s - stream.backlog_s, stream.poll_s))
             with self._allowed(needs):
                 self.safety_filter.check(commands, duration_s, self.clock.now_s(), made)
-                pulses, aims = self.wiring.pulses(commands), self.wiring.pulses(self._ahead(commands, duration_s))
+                ahead, pulses = self._ahead(commands, duration_s), self.wiring.pulses(commands)
+                aims = pulses if ahead is commands else self.wiring.pulses(ahead)
                 time_ms = max(1, round(1000 * duration_s))
                 lines = [
                     self.boards.by_name[name].move(found, time_ms, self.wiring.speeds(name, found), aims[name])

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import NamedTuple, Unpack
 
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.errors import (
@@ -22,7 +22,7 @@ from marl_handover.hardware.errors import (
 )
 from marl_handover.hardware.feetech import MODEL, FeetechBus, Status, sync_write, words
 from marl_handover.hardware.settings import COUNTS, PROTOCOLS, BoardConfig, BusConfig, TimeoutConfig
-from marl_handover.hardware.transport import BITS_PER_BYTE, LineRecord
+from marl_handover.hardware.transport import BITS_PER_BYTE, DeviceOptions, LineRecord
 
 LAG_S = 0.03
 """A servo is about so far behind its set point: its own softness, and the bus."""
@@ -76,8 +76,7 @@ class FeetechDriver(FeetechBus):
         servos: ids of all that have to be there.
         grippers: those of them that hold something: they may be kept from where they are sent.
         settings: how servos are set.
-        log_entries, on_wait: see :class:`~marl_handover.hardware.transport.WiredDevice`.
-        dry_run: write questions and stops only.
+        options: see :class:`~marl_handover.hardware.transport.WiredDevice`.
     """
 
     has_encoders = True
@@ -93,12 +92,10 @@ class FeetechDriver(FeetechBus):
         servos: Sequence[int],
         grippers: Collection[int],
         settings: BusConfig,
-        log_entries: int = 20_000,
-        dry_run: bool = False,
-        on_wait: Callable[[], object] = lambda: None,
+        **options: Unpack[DeviceOptions],
     ) -> None:
-        super().__init__(name, config, timeouts, clock, log_entries=log_entries, on_wait=on_wait)
-        self.dry_run, self._servos, self._grippers, self._settings = dry_run, list(servos), frozenset(grippers), settings
+        super().__init__(name, config, timeouts, clock, **options)
+        self._servos, self._grippers, self._settings = list(servos), frozenset(grippers), settings
         self._courses: dict[int, deque[_Course]] = {}
         self._goals: dict[int, int] = {}
         self._trims: dict[int, float] = {}
@@ -199,10 +196,6 @@ class FeetechDriver(FeetechBus):
             # A hand is kept from where it is sent by what it holds: that is nothing to be taken out.
             self._trims[servo] = 0.0 if servo in self._grippers else self._bounded(self._goals.get(servo, pulse) - pulse)
 
-    def referenced(self, channels: Iterable[int]) -> bool:
-        """Whether all these servos are held where they are known to be."""
-        return all(servo in self._courses for servo in channels)
-
     def first_move(self, pulses: Mapping[int, int], time_ms: int | None) -> LineRecord:
         """Hold servos where they stand, which ``pulses`` says. One that holds already keeps its goal, and so what it was trimmed by.
 
@@ -219,7 +212,7 @@ class FeetechDriver(FeetechBus):
             goals[servo] = kept
         self._goals.update(goals)
         self.note_readback(pulses)
-        sent = self._send(_MOVE, {servo: (goal, 0, _MIN_SPEED) for servo, goal in goals.items()})
+        sent = self._send(sync_write(_MOVE, {servo: (goal, 0, _MIN_SPEED) for servo, goal in goals.items()}))
         if not self.dry_run:
             self.write_all(("torque_enable",), {servo: (1,) for servo in goals})
             self._require_well(list(goals))
@@ -246,7 +239,7 @@ class FeetechDriver(FeetechBus):
             self._goals[servo] = self._goal(servo, pulse if aims is None else aims[servo])
             self._untried.add(servo)
             goals[servo] = (self._goals[servo], 0, speed)
-        return self._send(_MOVE, goals)
+        return self._send(sync_write(_MOVE, goals))
 
     def correct(self) -> None:
         """Send servos that stand still as much further as they lack, as far as :meth:`require_pulses` has learnt it."""
@@ -255,7 +248,7 @@ class FeetechDriver(FeetechBus):
         goals = {servo: self._goal(servo, self._set_point(servo, now_s)) for servo in still}
         changed = {servo: (goal, 0, _MIN_SPEED) for servo, goal in goals.items() if goal != self._goals.get(servo)}
         if changed:
-            self._send(_MOVE, changed)
+            self._send(sync_write(_MOVE, changed))
         self._goals.update(goals)
         self._untried.update(still)
 
@@ -286,7 +279,7 @@ class FeetechDriver(FeetechBus):
         """Let servos go: arms sink, but for a dry run. The next move is a first one."""
         listed = list(channels)
         self._forget(listed)
-        return self._send(("torque_enable",), {servo: (0,) for servo in listed})
+        return self._send(sync_write(("torque_enable",), {servo: (0,) for servo in listed}))
 
     def stop_s(self, channels: Sequence[int]) -> float:
         """How long a stop is on the wire at worst: it waits for the longest line."""
@@ -353,12 +346,6 @@ class FeetechDriver(FeetechBus):
 
     def _bounded(self, trim: float) -> float:
         return min(max(trim, -self._most_trim), self._most_trim)
-
-    def _send(self, names: Sequence[str], values: Mapping[int, Sequence[int]]) -> LineRecord:
-        data = sync_write(names, values)
-        if self.dry_run:
-            return LineRecord(self.name, self.wire.note_held_back(data), data, False)
-        return LineRecord(self.name, self.wire.write(data), data, True)
 
     def _forget(self, servos: Iterable[int] | None = None) -> None:
         for servo in list(self._courses if servos is None else servos):

@@ -15,7 +15,7 @@ from marl_handover.errors import CorruptFile
 from marl_handover.files import keep, write_whole
 from marl_handover.geometry.urdf import Gripper
 from marl_handover.hardware.calibration import CalibrationProblem, stored
-from marl_handover.hardware.settings import COUNTS_PER_RAD, PROTOCOLS, GripperConfig, HardwareConfig, ServoUnit
+from marl_handover.hardware.settings import COUNTS_PER_RAD, GripperConfig, HardwareConfig
 
 GRIPPERS_FILE = "grippers.json"
 _GRIPPERS_VERSION = 1
@@ -34,13 +34,26 @@ class GripperMap:
     """
 
     def __init__(self, config: HardwareConfig, arm: str, hand: Gripper) -> None:
-        self._gripper, self._hand, self._hinged = config.arms[arm].gripper, hand, config.protocol == "feetech"
+        self._gripper, self._hand, self._hinged, self._unit = config.arms[arm].gripper, hand, hand.kind == "jaw", config.unit
         self._widest_mm = min(config.gate.finger_mm, hand.travel_mm) if self._hinged else self._gripper.open_mm
 
     @property
     def closing_per_mm(self) -> float:
         """Change of the pulse as each finger closes by 1 mm, near closed."""
         return self._pulse(0.0) - self._pulse(1.0)
+
+    def shifted(self, further_mm: float) -> GripperConfig:
+        """The gripper with pulses at which each finger is ``further_mm`` nearer to closed.
+
+        Raises:
+            InvalidSetting: a servo has no such pulses.
+        """
+        shift = round(further_mm * self.closing_per_mm)
+        found = ("closed_us",) if self._hinged else _GRIPPERS_FOUND
+        moved = {name: getattr(self._gripper, name) + shift for name in found}
+        for name, pulse in moved.items():
+            require_between(f"gripper.{name}", pulse, self._unit.lower, self._unit.upper)
+        return replace(self._gripper, **moved)
 
     def closing_pulse(self, opening_mm: float, pin_diameter_mm: float) -> int:
         """The pulse for fingers ``opening_mm`` from closed, each. Asked to close, they go into the pin by the preload and no further."""
@@ -62,30 +75,6 @@ class GripperMap:
             turned = (self._hand.joint_values(opening_mm)[self._hand.joints[0]] - self._hand.closed[0]) / self._hand.opening[0]
             return gripper.closed_us + COUNTS_PER_RAD * turned
         return gripper.closed_us + opening_mm / gripper.open_mm * (gripper.open_us - gripper.closed_us)
-
-
-def shifted(
-    gripper: GripperConfig, further_mm: float, closing_per_mm: float | None = None, unit: ServoUnit = PROTOCOLS["ssc32"]
-) -> GripperConfig:
-    """``gripper`` with pulses at which each finger is ``further_mm`` nearer to closed.
-
-    Args:
-        gripper: as it is.
-        further_mm: how much nearer.
-        closing_per_mm: change of the pulse a millimetre; None: as a board's servo has it.
-        unit: of the pulses.
-
-    Raises:
-        InvalidSetting: a servo has no such pulses.
-    """
-    per_mm = (gripper.closed_us - gripper.open_us) / gripper.open_mm if closing_per_mm is None else closing_per_mm
-    shift = round(further_mm * per_mm)
-    moved = replace(gripper, closed_us=gripper.closed_us + shift)
-    if closing_per_mm is None:
-        moved.open_us += shift
-    for name in _GRIPPERS_FOUND if closing_per_mm is None else ("closed_us",):
-        require_between(f"gripper.{name}", getattr(moved, name), unit.lower, unit.upper)
-    return moved
 
 
 def save_grippers(folder: Path, asked: Mapping[str, GripperConfig], found: Mapping[str, GripperConfig]) -> Path:

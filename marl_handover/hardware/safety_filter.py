@@ -126,7 +126,7 @@ class SafetyFilter:
         speeds = [model.arm.description.joint(name).velocity for name in ARM_JOINTS]
         self.speed_rad_s = config.gate.speed_share * np.array(speeds)
         self._speed = np.append(self.speed_rad_s, config.gate.finger_mm_s)
-        self._most_change_deg_s = config.bus.speed_change_deg_s if config.protocol == "feetech" else math.inf
+        self._most_change_deg_s = config.bus.speed_change_deg_s if config.unit.encoders else math.inf
         self._held: list[_Held | None] = [None] * len(self._bases)
         # Compiled, or loaded, here: not between a plan and its first command.
         alone_mm(still(np.zeros(5)), self._shapes[0], np.full(3, -FAR_MM), np.empty(3))

@@ -33,19 +33,23 @@ SERVO_BAUDS = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38
 
 
 class ServoUnit(NamedTuple):
-    """What a servo is told: a pulse, in a unit of its own, from ``lower`` to ``upper``; it is told back in steps of ``reading``."""
+    """What a servo is told: a pulse, in a unit of its own, from ``lower`` to ``upper``; it is told back in steps of ``reading``.
+
+    ``encoders``: what is told back is where the servo stands, not where it was sent.
+    """
 
     name: str
     lower: int
     upper: int
     reading: int
+    encoders: bool
 
 
 COUNTS = 4096
 """Of a full turn of a bus servo."""
 COUNTS_PER_RAD = COUNTS / (2 * math.pi)
 
-PROTOCOLS = {"ssc32": ServoUnit("us", *PULSE_US, READING_US), "feetech": ServoUnit("counts", 0, COUNTS - 1, 1)}
+PROTOCOLS = {"ssc32": ServoUnit("us", *PULSE_US, READING_US, False), "feetech": ServoUnit("counts", 0, COUNTS - 1, 1, True)}
 """What drives servos may speak, and the unit of their pulses: microseconds of a board's, counts of the encoder of a bus servo."""
 
 _WIDEST = (0, COUNTS - 1)

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Any, TypeVar
+from typing import Any, TypeVar, Unpack
 
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.errors import (
@@ -39,7 +39,7 @@ from marl_handover.hardware.settings import (
     StreamConfig,
     TimeoutConfig,
 )
-from marl_handover.hardware.transport import BITS_PER_BYTE, CANCEL, LineRecord, Wire, WiredDevice
+from marl_handover.hardware.transport import BITS_PER_BYTE, CANCEL, DeviceOptions, LineRecord, Wire, WiredDevice
 
 MAX_LINE_BYTES = 256
 """No buffer size is published; this fits positions of all 32 channels with a time, and no driver in use sends longer lines."""
@@ -198,24 +198,13 @@ MOVED_US = 100
 
 
 class Ssc32(WiredDevice):
-    """A board by the name it has in the settings. ``dry_run``: write queries and stops only; the other arguments are the base class's."""
+    """A board by the name it has in the settings. For its arguments see the base class."""
 
     has_encoders = False
     """Where a servo stands that has no pulse, nobody knows: its first move is a jump."""
 
-    def __init__(
-        self,
-        name: str,
-        config: BoardConfig,
-        timeouts: TimeoutConfig,
-        clock: Clock,
-        *,
-        log_entries: int = 20_000,
-        dry_run: bool = False,
-        on_wait: Callable[[], object] = lambda: None,
-    ) -> None:
-        super().__init__(name, config, timeouts, clock, log_entries=log_entries, on_wait=on_wait)
-        self.dry_run = dry_run
+    def __init__(self, name: str, config: BoardConfig, timeouts: TimeoutConfig, clock: Clock, **options: Unpack[DeviceOptions]) -> None:
+        super().__init__(name, config, timeouts, clock, **options)
         self.firmware: Firmware | None = None
         self._known: set[int] = set()
         self._expected = ExpectedPulses()
@@ -383,11 +372,6 @@ class Ssc32(WiredDevice):
             heard_s = self._clock.now_s() + self.wire.backlog_s()
             self._expected.move(pulses_us, (time_ms or 0) / 1000, speeds_us_s, sent.t_s, heard_s)
         return sent
-
-    def _send(self, line: bytes) -> LineRecord:
-        if self.dry_run:
-            return LineRecord(self.name, self.wire.note_held_back(line), line, False)
-        return LineRecord(self.name, self.wire.write(line), line, True)
 
     def _handshake(self, wire: Wire) -> Firmware:
         """The firmware; the wire is left at the rate at which it answered."""

@@ -10,7 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import serial
 from serial.tools import list_ports
@@ -170,6 +170,14 @@ class Wire:
             raise PortLost(self.port, what, " ".join(str(error).split())) from error
 
 
+class DeviceOptions(TypedDict, total=False):
+    """What every device on a wire takes by name; see :class:`WiredDevice`."""
+
+    log_entries: int
+    dry_run: bool
+    on_wait: Callable[[], object]
+
+
 class WiredDevice:
     """What is reached over a wire, open or not.
 
@@ -179,6 +187,7 @@ class WiredDevice:
         timeouts: limits of waiting.
         clock: time.
         log_entries: length of the byte log.
+        dry_run: write questions and stops only.
         on_wait: is called time and again while an answer is waited for; it may raise.
     """
 
@@ -190,9 +199,10 @@ class WiredDevice:
         clock: Clock,
         *,
         log_entries: int = 20_000,
+        dry_run: bool = False,
         on_wait: Callable[[], object] = lambda: None,
     ) -> None:
-        self.name, self.config = name, config
+        self.name, self.config, self.dry_run = name, config, dry_run
         self._timeouts, self._clock, self._attend = timeouts, clock, on_wait
         self._log: deque[Logged] = deque(maxlen=log_entries)
         self._wire: Wire | None = None
@@ -214,6 +224,12 @@ class WiredDevice:
         if self._wire is not None:
             self._wire.close()
         self._wire = None
+
+    def _send(self, data: bytes) -> LineRecord:
+        """Write what makes servos move or let go; a dry run only notes it."""
+        if self.dry_run:
+            return LineRecord(self.name, self.wire.note_held_back(data), data, False)
+        return LineRecord(self.name, self.wire.write(data), data, True)
 
     def _opened(self) -> Wire:
         """A wire to the port of the settings, or to the only likely one. Raises :class:`PortNotFound`."""

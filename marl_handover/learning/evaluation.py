@@ -239,6 +239,8 @@ def mistaken(rules: Rules, seed: int) -> Callable[[Act], Act]:
     generator = np.random.default_rng([seed, 1])  # other draws than those of placements
 
     def misled(act: Act) -> Act:
+        """``act`` of somebody who sees the object a little beside where it is."""
+
         def seeing(pose: Floats, goal: Floats, previous_arm: NDArray[np.int64]) -> Floats:
             offset = generator.normal(size=pose.shape) * scale
             seen: Floats = act(carried(pose, pose[..., :2] + offset[..., :2], offset[..., 2]), goal, previous_arm)

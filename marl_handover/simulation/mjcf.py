@@ -121,6 +121,7 @@ class _Writer:
         pads, levels = finger_links(description), joints_before(description)
 
         def add(parent: ET.Element, name: str, frame: dict[str, str], joint: Joint | None) -> None:
+            """A link, and all that it carries."""
             body = self._add(parent, "body", name=named(index, name), **frame)
             self._inertial(body, links[name].inertial)
             if joint is not None and joint.kind != "fixed":

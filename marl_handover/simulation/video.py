@@ -91,6 +91,7 @@ def _mp4(path: Path, fps: float, seekable: bool) -> Iterator[Add]:
     with tempfile.TemporaryFile() as said:
 
         def add(frame: Pixels) -> None:
+            """Hand a frame to ffmpeg."""
             nonlocal process
             process = process or _ffmpeg(path, fps, frame.shape, said, seekable)
             assert process.stdin is not None

@@ -121,9 +121,11 @@ def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
     """``serve`` of websockets, for local pages only, with limits and headers."""
 
     def open_socket(*args: Any, **options: Any) -> Any:
+        """``serve`` with the limits."""
         page = options.pop("process_request")
 
         def answer(connection: ServerConnection, request: Request) -> Response | None:
+            """A page, a refusal, or None: the socket is opened."""
             hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
             wrong = refusal(", ".join(hosts), ", ".join(origins) if origins else None)
             if wrong:
@@ -136,6 +138,7 @@ def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
             return answered
 
         def seal(_: ServerConnection, request: Request, response: Response) -> Response:
+            """A response with the headers that keep a page to itself."""
             for name, value in HEADERS.items():
                 response.headers[name] = value
             if not refusal(", ".join(request.headers.get_all("Host")), None):  # else it holds what the client likes

@@ -18,16 +18,24 @@ from marl_handover.control.settings import WatchConfig, twin_workcell
 from marl_handover.errors import CorruptFile, InvalidSetting
 from marl_handover.geometry.urdf import Gripper
 from marl_handover.hardware.calibration import CalibrationProblem
-from marl_handover.hardware.gripper import GRIPPERS_FILE, GripperMap, save_grippers, shifted, with_grippers
+from marl_handover.hardware.gripper import GRIPPERS_FILE, GripperMap, save_grippers, with_grippers
 from marl_handover.hardware.settings import ARMS, ArmWiring, GripperConfig, HardwareConfig
 
 PIN_MM = 2.5
 
 
+def pulses_of(gripper):
+    """What a board's servo is told, and back."""
+    return GripperMap(HardwareConfig(arms={"left": ArmWiring(gripper=gripper)}), "left", Gripper())
+
+
 def pulse(gripper, opening_mm, pin_mm=PIN_MM):
     """What a board's servo is told for fingers so far from closed."""
-    hardware = HardwareConfig(arms={"left": ArmWiring(gripper=gripper)})
-    return GripperMap(hardware, "left", Gripper()).closing_pulse(opening_mm, pin_mm)
+    return pulses_of(gripper).closing_pulse(opening_mm, pin_mm)
+
+
+def shifted(gripper, further_mm):
+    return pulses_of(gripper).shifted(further_mm)
 
 
 @pytest.fixture

@@ -46,7 +46,7 @@ from marl_handover.hardware.errors import (
     UnsuitableFirmware,
 )
 from marl_handover.hardware.estop import StopLatch
-from marl_handover.hardware.gripper import GripperMap, shifted
+from marl_handover.hardware.gripper import GripperMap
 from marl_handover.hardware.lerobot_file import MOTORS, read_motors, write_motors
 from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason
 from marl_handover.hardware.settings import ARMS, COUNTS, HardwareConfig
@@ -96,23 +96,6 @@ def rig(model, tmp_path):
         rig.driver.close()
 
 
-@pytest.fixture
-def armed(rig):
-    def make(*arguments, **keywords):
-        made = rig(*arguments, **keywords)
-        made.driver.connect()
-        made.driver.configure()
-        made.driver.arm()
-        return made
-
-    return make
-
-
-def raw(servo):
-    """Registers as they are, without a wire."""
-    return {name: servo[name] for name in ("torque_enable", "goal_position", "present_position", "homing_offset")}
-
-
 def now_rad(rig):
     """(2, 5): where the encoders say that the joints are, through the nominal calibration."""
     told = rig.cell.told(rig.clock.now_s())
@@ -153,12 +136,12 @@ def test_switching_on_moves_nothing_at_a_thousand_postures(model):
 
 
 def starts_without_a_jump(model, seed):
-    """Held where it stands, limp or after another program's goal: no servo turns by more than its own sag."""
+    """Held where it stands, whatever speed another program left: no servo turns by more than its load takes it, and its play lets it."""
     random = np.random.default_rng(seed)
     arm = model.arm
     standing = random.uniform(arm.lower_rad + 0.1, arm.upper_rad - 0.1)
     config = hardware().for_arms(model.cell.names)
-    clock, cell = VirtualClock(), EmulatedServoCell(config, arm, standing, holding_n_m=lambda q: 0.2 * holding_n_m(arm, q))
+    clock, cell = VirtualClock(), EmulatedServoCell(config, arm, standing, holding_n_m=lambda q: holding_n_m(arm, q))
     cell.mount(clock)
     for servo in cell.servos(0):
         servo.take(feetech.REGISTERS["goal_speed"].address, feetech.encoded("goal_speed", 3000))
@@ -169,11 +152,13 @@ def starts_without_a_jump(model, seed):
         pulses = driver.boards.pulses()
         before = cell.joints_rad(clock.now_s())
         driver.boards.first_move({name: {servo: int(at) for servo, at in found.items()} for name, found in pulses.items()}, 200)
-        worst = 0.0
+        softest_n_m_rad = 27.0 * (1 - config.emulator.bus_stiffness_share)
+        sag_rad = np.concatenate([[0.0], np.abs(holding_n_m(arm, standing[None])[0]) * 1.1 / softest_n_m_rad, [0.0]])
+        most_rad = sag_rad + math.radians(config.emulator.bus_play_deg[1] / 2 + 0.3)  # and a few counts
         for _ in range(20):
             clock.sleep_s(0.02)
-            worst = max(worst, float(np.abs(cell.joints_rad(clock.now_s()) - before).max()))
-        assert worst < math.radians(3.0), f"{math.degrees(worst):.1f} degrees"
+            turned_rad = np.abs(cell.joints_rad(clock.now_s()) - before)
+            assert (turned_rad <= most_rad).all(), f"{np.degrees(turned_rad).round(2)} of {np.degrees(most_rad).round(2)} degrees"
     finally:
         driver.boards.close()
 
@@ -232,6 +217,10 @@ def test_a_motion_is_followed_and_its_end_reached(armed):
     assert np.abs(now_rad(rig) - rig.driver.joints_rad()).max() < math.radians(0.5)
 
 
+HOLD = bytes([feetech.SYNC_WRITE, feetech.REGISTERS["goal_position"].address, 2])
+"""How a packet begins that gives servos a goal, and nothing else: ids and goals follow."""
+
+
 def check_stops(make, count, seed=0):
     random = np.random.default_rng(seed)
     rig = make()
@@ -241,9 +230,13 @@ def check_stops(make, count, seed=0):
         with contextlib.suppress(CommandRejected):
             rig.driver.move([JointCommand(0, np.clip(target, *limits(rig)), 12.0)], 0.12)
         rig.clock.sleep_s(float(random.uniform(0.0, 0.12)))
+        began_s = rig.clock.now_s()
         rig.driver.stop("test")
-        told = rig.clock.now_s()
-        rig.clock.sleep_s(max(0.0, told + 0.04 - rig.clock.now_s()))
+        rig.clock.sleep_s(max(0.0, began_s + 0.04 - rig.clock.now_s()))
+        for name, device in rig.cell.devices.items():
+            device.advance(rig.clock.now_s())
+            held = [body[5::3] for t_s, body in device.lines if t_s >= began_s and body[2:5] == HOLD]
+            assert bytes(rig.config.channels(name)) in held, "every servo has its place to hold within 40 ms"
         held = rig.cell.joints_rad(rig.clock.now_s())
         rig.clock.sleep_s(0.3)
         assert np.abs(rig.cell.joints_rad(rig.clock.now_s()) - held).max() < math.radians(2.5), "a servo goes on"
@@ -587,8 +580,7 @@ def test_a_jaw_opens_as_its_hinge_turns_and_back(model, opening_mm):
 def test_a_jaw_closes_further_by_as_much_as_it_is_told(model, further_mm):
     config = hardware()
     before = GripperMap(config, "left", model.arm.description.gripper)
-    moved = shifted(config.arms["left"].gripper, further_mm, before.closing_per_mm, config.unit)
-    config.arms["left"].gripper = moved
+    config.arms["left"].gripper = before.shifted(further_mm)
     after = GripperMap(config, "left", model.arm.description.gripper)
     assert before.mm(after.closing_pulse(8.0, 2.5)) == pytest.approx(8.0 - further_mm, abs=0.08)
 
