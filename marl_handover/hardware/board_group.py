@@ -14,7 +14,7 @@ from marl_handover.geometry.arm_model import LIMIT_TOLERANCE_RAD, ArmModel
 from marl_handover.geometry.urdf import ARM_JOINTS, Gripper
 from marl_handover.hardware.calibration import ArmCalibration
 from marl_handover.hardware.clock import Clock
-from marl_handover.hardware.errors import BadCommand, BoardReset, ConnectionLost, TooSlow, WrongState
+from marl_handover.hardware.errors import BadCommand, BoardReset, ConnectionLost, TooSlow, TorqueLost, WrongState
 from marl_handover.hardware.feetech_driver import FeetechDriver
 from marl_handover.hardware.gripper import GripperMap
 from marl_handover.hardware.safety_filter import CommandRejected, JointCommand, Reason
@@ -279,10 +279,10 @@ class BoardGroup:
         return [self.by_name[wiring.board].marks(config.channels(name)) for name, wiring in config.arms.items()]
 
     def require_holding(self) -> None:
-        """Raise :class:`BoardReset` if a servo does not hold: where it stands is not where it was sent, whether or not that is known."""
+        """Raise :class:`TorqueLost` if a servo does not hold, although it is known where it stands: that is not where it was sent."""
         for name, board in self.by_name.items():
             if limp := board.limp(self._channels[name]):
-                raise BoardReset(name, limp)
+                raise TorqueLost(name, limp)
 
     def note_readback(self, pulses: Mapping[str, Mapping[int, int | None]]) -> None:
         """Take readings for where the channels stand. See :meth:`Ssc32.note_readback`."""

@@ -59,6 +59,7 @@ _JUMP = (
     "A board does not know where its arms are: its first move is a jump at full speed. Are {} arms standing in the parked pose, "
     "upright and drawn in, with the table free and a hand at the power switch?"
 )
+_ZEROS = " NOT CALIBRATED: {}. Zeros may be off by some degrees, and so are all places: keep the table free."
 _NOMINAL = " NOT CALIBRATED: {}. With a horn one tooth off, 15 degrees, an arm jumps by that much: stay clear until it has moved."
 
 
@@ -123,7 +124,7 @@ class ArmDriver(ArmConnection):
             CommandRejected: the parked pose is not allowed, or the way there is not clear; let the arms go limp and put them there.
             HalfHeld: only some channels have a pulse, and letting go did not help (a dry run lets nothing go).
             Stopped: somebody stopped the arms meanwhile.
-            BoardReset: a board shows no pulse even after the move.
+            BoardReset, TorqueLost: a board shows no pulse even after the move, or a servo does not hold.
             PulseMismatch: it shows others than it was sent.
         """
         if self.state not in (State.CONFIGURED, State.ARMED):
@@ -180,7 +181,7 @@ class ArmDriver(ArmConnection):
         Every channel is sent where it is, to 10 us, which is the first move that a board wants to see after a new connection.
 
         Raises:
-            BoardReset: a board has forgotten its arms; they have to be armed.
+            BoardReset, TorqueLost: a board has forgotten its arms, or servos let go; they have to be armed.
             CommandRejected: it holds one outside its limits.
             Stopped: the stop is latched, or somebody stopped the arms meanwhile.
         """
@@ -323,7 +324,8 @@ class ArmDriver(ArmConnection):
         """Of arms that nobody has calibrated, and of a safety filter that is off."""
         off = "" if self.config.gate.enabled else f" {FILTER_OFF}."
         nominal = [calibration.arm for calibration in self.calibrations if calibration.measured_unix_s == 0.0]
-        return off + (_NOMINAL.format(" and ".join(nominal)) if nominal else "")
+        words = _ZEROS if self.boards.have_encoders else _NOMINAL
+        return off + (words.format(" and ".join(nominal)) if nominal else "")
 
     def _jump(self, commands: Sequence[JointCommand]) -> MoveRecord:
         """The first move of boards that know no position: they jump, whatever time they are given."""

@@ -145,6 +145,17 @@ class BoardReset(ArmingLost):
         )
 
 
+class TorqueLost(ArmingLost):
+    """Bus servos hold no more: their supply broke down, or another program let them go."""
+
+    def __init__(self, bus: str, servos: Iterable[int]) -> None:
+        self.bus, self.servos = bus, tuple(servos)
+        super().__init__(
+            f"bus {bus}: servo {', '.join(map(str, self.servos))} does not hold, and its arm has sunk: most likely the supply broke down. "
+            "Fold the arm by hand, and arm again"
+        )
+
+
 class PulseMismatch(DeviceError):
     """A board puts out another pulse than it was sent: it does not carry out its moves, or answers anything."""
 

@@ -13,11 +13,11 @@ from typing import NamedTuple, Unpack
 
 from marl_handover.hardware.clock import Clock
 from marl_handover.hardware.errors import (
-    BoardReset,
     NoReference,
     PulseMismatch,
     ServoAstray,
     ServoFault,
+    TorqueLost,
     UnsuitableFirmware,
 )
 from marl_handover.hardware.feetech import MODEL, FeetechBus, Status, sync_write, words
@@ -153,7 +153,7 @@ class FeetechDriver(FeetechBus):
         ``tolerance`` is that of boards, and not used: encoders tell the truth, and how far servos may be behind is ``bus.follow_deg``.
 
         Raises:
-            BoardReset: servos do not hold: the supply broke down.
+            TorqueLost: servos do not hold: the supply broke down.
             ServoFault: one reports an overload, or other trouble.
             PulseMismatch: one is held by something, or too weak.
             ServoMissing: one does not answer.
@@ -163,11 +163,11 @@ class FeetechDriver(FeetechBus):
             return
         try:
             present = self._well(listed)
-        except (BoardReset, ServoFault, PulseMismatch):
+        except (TorqueLost, ServoFault, PulseMismatch):
             try:  # a damaged answer may look like a whole one: bad news is believed when it comes twice
                 present = self._well(listed)
-            except BoardReset as reset:
-                self._forget(reset.channels)  # nothing is to be sent to these: a goal would switch them on, at full speed
+            except TorqueLost as lost:
+                self._forget(lost.servos)  # nothing is to be sent to these: a goal would switch them on, at full speed
                 raise
         for servo in listed:
             if servo in self._untried and servo not in self._grippers:
@@ -179,7 +179,7 @@ class FeetechDriver(FeetechBus):
         now_s = self._clock.now_s()
         limp = [servo for servo in listed if not state[servo][0]]
         if limp:
-            raise BoardReset(self.name, limp)
+            raise TorqueLost(self.name, limp)
         for servo in listed:
             if status := Status(state[servo][3]):
                 raise ServoFault(self.name, servo, words(status))

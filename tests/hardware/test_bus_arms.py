@@ -33,7 +33,6 @@ from marl_handover.hardware.connection import State
 from marl_handover.hardware.driver import ArmDriver
 from marl_handover.hardware.emulator.servo_bus import EmulatedServoCell, parse_servo_faults
 from marl_handover.hardware.errors import (
-    BoardReset,
     DeviceError,
     DuplicateServo,
     NotConfirmed,
@@ -43,6 +42,7 @@ from marl_handover.hardware.errors import (
     ServoFault,
     ServoMissing,
     Stopped,
+    TorqueLost,
     UnsuitableFirmware,
 )
 from marl_handover.hardware.estop import StopLatch
@@ -184,11 +184,15 @@ def test_an_arm_creeps_to_the_parked_pose(rig, model):
 
 
 def test_nobody_confirms_and_nothing_is_switched_on(rig):
-    made = rig(confirm=lambda text: False)
+    asked = []
+    made = rig(confirm=lambda text: asked.append(text))
     made.driver.connect()
     made.driver.configure()
     with pytest.raises(NotConfirmed):
         made.driver.arm()
+    assert "switched on where the arms stand" in asked[0]
+    assert "NOT CALIBRATED: left and right. Zeros may be off" in asked[0]
+    assert "jump" not in asked[0], "that is of boards"
     assert not any(servo.holds for device in made.cell.devices.values() for servo in device.servos)
 
 
@@ -326,7 +330,7 @@ def test_none_of_ten_thousand_commands_makes_arms_leave_their_limits(armed):
 
 
 FAULTS = {
-    "brownout": (BoardReset, State.CONFIGURED),
+    "brownout": (TorqueLost, State.CONFIGURED),
     "overload=2": (ServoFault, State.CONFIGURED),
     "missing=3": (ServoMissing, State.LOST),
     "silent": (ServoMissing, State.LOST),
@@ -362,12 +366,12 @@ def test_after_a_servo_that_was_gone_the_arms_go_on_where_they_are_held(armed):
 def test_after_a_brown_out_arms_are_not_taken_to_be_where_they_fell(armed):
     rig = armed()
     rig.left.add_faults(parse_servo_faults(f"brownout@{rig.clock.now_s() + 0.1}"))
-    with pytest.raises(BoardReset):
+    with pytest.raises(TorqueLost):
         swing(rig, 20)
     rig.driver.halt()
     rig.clock.sleep_s(0.1)
     assert not any(servo.holds for servo in rig.left.servos), "a goal would have switched them on, wherever they are"
-    with pytest.raises(BoardReset):
+    with pytest.raises(TorqueLost):
         rig.driver.resync()
 
 
